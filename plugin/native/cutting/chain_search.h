@@ -49,7 +49,8 @@ struct Plan {
   Few there, movers;  // vertices of the seam, and those that may move
   D3* goal;
   Move* move;
-  int *seen, *part, stopped;
+  Parts parts;  // around the former
+  int *seen, stopped;
 
   template <class S>
   PALPATE D3 place(const S& m, int v) const {
@@ -64,7 +65,7 @@ PALPATE Plan new_plan(const S& m, const Chains& chains, Scratch& memory) {
   Plan out = {};
   out.seam = {memory.numbers(2 * chains.most), 0, memory.numbers(3 * m.nelem)};
   out.there = few(memory, m.nvert), out.movers = few(memory, m.nvert);
-  out.seen = memory.numbers(m.nvert), out.part = memory.numbers(m.most);
+  out.seen = memory.numbers(m.nvert), out.parts = parts_of(memory, 3 * m.nelem);
   out.goal = (D3*)memory.values(3 * m.nvert);
   out.move = (Move*)memory.values(m.nvert * (int)(sizeof(Move) / sizeof(double)));
   return out;
@@ -153,7 +154,7 @@ struct Mender {
     plan.seam.count = 0;
     plan.there.clear(), plan.movers.clear();
     find_seam(m, path, chains, plan.seam);
-    plan.stopped = find_room(m, plan.seam, left, plan.there, plan.part);
+    plan.stopped = find_room(m, plan.seam, left, plan.there, plan.parts);
     find_goals(m, path, chains, plan.there, pinned, plan.movers, plan.goal, plan.seen);
     return find_moves(m, p, plan.goal, plan.movers, plan.move, memory);
   }

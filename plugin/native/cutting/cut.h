@@ -92,11 +92,12 @@ struct Changes {
 
 // Moves and doubles the vertices of a seam, and renews what is around them.
 template <class S, class P>
-PALPATE bool apply(const S& m, const Moving& x, const Move* move, int nmove, const Seam& seam,
-                   const Few& there, const P* pinned, Changes& out, Scratch& memory) {
+PALPATE bool apply(const S& m, const Moving& x, int nmove, Plan& plan, const P* pinned, Changes& out,
+                   Scratch& memory) {
+  const Move* move = plan.move;
+  const Few& there = plan.there;
   Few moved = few(memory, m.nvert), &near = out.elem;
-  int *part = memory.numbers(m.most), *size = memory.numbers(m.most), *row = memory.numbers(m.most);
-  int* source = memory.numbers(m.nvert);
+  int *row = memory.numbers(m.most), *source = memory.numbers(m.nvert);
   D3 *to = (D3*)memory.values(3 * nmove), *from = (D3*)memory.values(3 * nmove);
   if (memory.full) return false;
   for (int i = 0; i < nmove; ++i) {
@@ -114,7 +115,7 @@ PALPATE bool apply(const S& m, const Moving& x, const Move* move, int nmove, con
   if (memory.full) return false;
   for (int i = 0; i < 3 * near.count; ++i) out.before[i] = (int)m.elem[3 * near.list[i / 3] + i % 3];
   for (int i = 0; i < nmove; ++i) store(m.rest + 3 * move[i].vert, to[i]);
-  double_vertices(m, seam, there, part, size, out.split);
+  double_vertices(m, plan.parts, out.split);
   for (int i = 0; i < out.split.count; ++i)
     store(m.rest + 3 * out.split.member[i], m.place(out.split.group[i]));
   rejoin(m, near, out.before, moved, out.split, out.vert, row, source);
@@ -167,7 +168,7 @@ PALPATE int cut_along(const F& f, const S& m, const Material& p, const Path& pat
     return NO_ROOM;
   found[FOUND_STOPPED] = plan.stopped;
   const int nmove = those_that_move(plan.move, plan.movers.count);
-  if (!apply(m, x, plan.move, nmove, plan.seam, plan.there, pinned, made, memory)) return NO_ROOM;
+  if (!apply(m, x, nmove, plan, pinned, made, memory)) return NO_ROOM;
   answer(f, made, plan.seam, nmove);
   f.size.data[SIZE_DEVIATION] = deviation_of(m, path, chains, plan.there);
   bool apart = false;

@@ -1,6 +1,7 @@
 // The mesh comes apart along edges: vertices on them are doubled. Triangles keep their numbers.
 #pragma once
 #include "cutting/chain.h"
+#include "cutting/parts.h"
 
 namespace palpate {
 
@@ -19,42 +20,24 @@ PALPATE void mark(const S& m, Seam& seam, int count, int value) {
   }
 }
 
-// Tells which part of a vertex's fan each of its spokes is in, once the marked edges came apart; returns
-// how many parts.
-template <class S>
-PALPATE int parts_of(const S& m, const int* cut, int v, int* part) {
-  const int degree = (int)m.degree[v];
-  int last = 0, filled = 0;
-  for (int k = 0; k < degree; ++k) {
-    const int h = m.half(v, k);
-    if (h >= 0 && cut[h] && filled) ++last, filled = 0;
-    part[k] = last;
-    filled += h >= 0;
-  }
-  const bool joined = m.half(v, degree - 1) >= 0 && last > 0 && !cut[m.half(v, 0)];
-  for (int k = 0; k < degree && joined; ++k)
-    if (part[k] == last) part[k] = 0;
-  return joined ? last : last + 1;
-}
-
 // Takes of the edges as many, from the first one, as there are spare vertices for, none where none would
 // come apart; returns whether they are fewer for want of these.
 template <class S>
-PALPATE bool find_room(const S& m, Seam& seam, int left, Few& vert, int* part) {
+PALPATE bool find_room(const S& m, Seam& seam, int left, Few& vert, Parts& parts) {
   bool fewer = false;
   while (seam.count) {
     mark(m, seam, seam.count, 1);
-    vert.clear();
+    vert.clear(), parts.clear();
     int need = 0;
     for (int i = 0; i < 2 * seam.count; ++i)
-      if (vert.put(seam.pair[i])) need += parts_of(m, seam.cut, seam.pair[i], part) - 1;
+      if (vert.put(seam.pair[i])) need += find_parts(m, seam.pair[i], seam.cut, parts) - 1;
     if (need && need <= left) return fewer;
     mark(m, seam, seam.count, 0);
     const int over = need - left;
     if (need) seam.count -= over < seam.count ? over : seam.count, fewer = true;
     else seam.count = 0;  // it was cut already
   }
-  vert.clear();
+  vert.clear(), parts.clear();
   return fewer;
 }
 
@@ -62,22 +45,13 @@ PALPATE bool find_room(const S& m, Seam& seam, int left, Few& vert, int* part) {
 struct Split { int *group, *member, count, following; };
 
 template <class S>
-PALPATE void double_vertices(const S& m, const Seam& seam, const Few& vert, int* part, int* size,
-                             Split& out) {
-  for (int i = 0; i < vert.count; ++i) {
-    const int v = vert.list[i], n = parts_of(m, seam.cut, v, part);
-    if (n < 2) continue;
-    for (int p = 0; p < n; ++p) size[p] = 0;
-    for (int k = 0; k < m.degree[v]; ++k) size[part[k]] += m.half(v, k) >= 0;
-    int kept = 0;
-    for (int p = 1; p < n; ++p) kept = size[p] > size[kept] ? p : kept;
-    for (int p = 0; p < n; ++p) {
-      const int name = p == kept ? v : out.following++;
-      for (int k = 0; k < m.degree[v]; ++k)
-        if (part[k] == p && m.half(v, k) >= 0) m.elem[m.half(v, k)] = name;
-      out.group[out.count] = v, out.member[out.count++] = name;
-    }
-  }
+PALPATE void double_vertices(const S& m, Parts& parts, Split& out) {
+  name_parts(parts, out.following, [](int) { return true; });
+  rename(m, parts, false);
+  each_divided(parts, [&](int first, int last) {
+    for (int k = first; k < last; ++k)
+      out.group[out.count] = parts.vert[k], out.member[out.count++] = parts.name[k];
+  });
 }
 
 // Walks around a vertex by its spokes, of which `row` has those that it or what it came from had.

@@ -46,6 +46,10 @@ struct Surface {
     for (int c = 0; c < 3; ++c) x[c] = place((int)elem[3 * t + c]);
   }
   PALPATE int vert(int corner) const { return (int)elem[corner]; }
+  PALPATE I* cells() const { return elem; }
+  // An edge, 0 or 1, of the triangle of a corner that has its vertex; the edge beside one, -1 for none.
+  PALPATE int facet(int corner, int k) const { return k ? last_half(corner) : corner; }
+  PALPATE int beside(int half) const { return (int)twin[half]; }
   PALPATE int size() const { return nelem; }
   PALPATE int most_triangles() const { return 0; }
   PALPATE bool inside(int) const { return false; }

@@ -264,7 +264,7 @@ class Knife(Native):
     n, self._config, self._how = 2 * n, None, ()
     self._room, sizes = n, self._copy.sizes | {"npath": 0}
     # What cutting/cut.h takes of scratch, see there.
-    sizes["nint"] = 29 * whole.nvert + 20 * whole.nelem + 20 * n + 8 * sizes["most"] + 100
+    sizes["nint"] = 29 * whole.nvert + 41 * whole.nelem + 20 * n + 8 * sizes["most"] + 100
     sizes["nreal"] = 48 * whole.nvert + 9 * whole.nelem + 13 * n
     fields = allocate(Cutting, "cpu", sizes)
     fields.surface, fields.edge = self._copy.fields, whole.edge_length

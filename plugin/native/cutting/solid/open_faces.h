@@ -2,6 +2,7 @@
 // of the skin come first, those inside last; what comes on to the surface takes the numbers between, of
 // spare vertices, and its old ones are used no more.
 #pragma once
+#include "cutting/parts.h"
 #include "cutting/solid/solid_mesh.h"
 
 namespace palpate {
@@ -35,7 +36,7 @@ PALPATE void find_opening(const S& m, Opening& o) {
   o.vert.sort(m.nvert);
   int* many = o.ring;  // of each vertex
   for (int i = 0; i < o.vert.count; ++i)
-    many[i] = find_parts(m, o.vert.list[i], m.seat[o.vert.list[i]], o.cut, o.parts);
+    many[i] = find_parts(m, o.vert.list[i], o.cut, o.parts);
   mark_faces(m, o, o.face, o.count, 0);
   o.nparting = 0;
   for (int i = 0; i < o.count; ++i) {
@@ -49,32 +50,8 @@ PALPATE void find_opening(const S& m, Opening& o) {
   for (int i = 0; i < 3 * o.nparting; ++i) o.vert.put(m.face_vert(o.parting[i / 3], i % 3));
   o.vert.sort(m.nvert);
   for (int i = 0; i < o.vert.count; ++i)
-    find_parts(m, o.vert.list[i], m.seat[o.vert.list[i]], o.cut, o.parts);
+    find_parts(m, o.vert.list[i], o.cut, o.parts);
   mark_faces(m, o, o.parting, o.nparting, 0);
-}
-
-// Gives parts their numbers: the largest one of a vertex on the surface keeps its own.
-template <class S>
-PALPATE bool name_parts(const S& m, Opening& o) {
-  Parts& p = o.parts;
-  o.following = o.nouter;
-  for (int first = 0, last; first < p.count; first = last) {
-    int kept = first;
-    for (last = first; last < p.count && p.vert[last] == p.vert[first]; ++last)
-      if (p.size[last] > p.size[kept]) kept = last;
-    const bool keeps = p.vert[first] < m.nskin && !o.renew.has(p.vert[first]);
-    for (int k = first; k < last; ++k) p.name[k] = keeps && k == kept ? p.vert[k] : o.following++;
-  }
-  return o.following <= m.nskin;
-}
-
-// Lets the corners around have the names of their parts, or their old ones again.
-template <class S>
-PALPATE void rename(const S& m, const Parts& p, bool back) {
-  for (int i = 0; i < p.ncorner; ++i) {
-    const int k = p.part[p.corner[i]] - 1;
-    m.tet[p.corner[i]] = back ? p.vert[k] : p.name[k];
-  }
 }
 
 // Calls body(corner) for the corners of tetrahedra that get other vertices.
@@ -111,7 +88,9 @@ PALPATE bool fit(const S& m, Opening& o, int ntriangle, Scratch& memory) {
     o.renew.clear();
     find_opening(m, o);
     for (bool again = true; again;) {
-      again = false, named = name_parts(m, o);
+      again = false, o.following = o.nouter;
+      name_parts(o.parts, o.following, [&](int v) { return v < m.nskin && !o.renew.has(v); });
+      named = o.following <= m.nskin;
       if (!named) break;
       find_tight(m, o, near, tight);
       for (int i = 0; i < tight.count; ++i)

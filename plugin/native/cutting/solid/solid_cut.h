@@ -194,17 +194,15 @@ PALPATE int share_masses(const S& m, const Opening& o, const Moving& x, const F&
     volume[p.part[p.corner[i]] - 1] += volume_of(corner);
   }
   int count = 0;
-  for (int first = 0, last; first < p.count; first = last) {
+  each_divided(p, [&](int first, int last) {
     const int v = p.vert[first];
-    for (last = first; last < p.count && p.vert[last] == v; ++last) {}
-    if (last == first + 1 && p.name[first] == v) continue;
     for (int k = first; k < last; ++k) {
       const int i = count + k - first;
       f.group.data[i] = v, f.member.data[i] = p.name[k], f.sat.data[i] = p.first[k], f.share.data[i] = volume[k];
     }
     share_mass(x, v, f.member.data + count, f.share.data + count, last - first);
     count += last - first;
-  }
+  });
   return count;
 }
 

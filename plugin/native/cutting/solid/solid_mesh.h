@@ -39,7 +39,9 @@ struct Solid {
   PALPATE bool inside(int v) const { return v >= nskin; }
   PALPATE double quality(const D3* x) const { return quality_of(x); }
   PALPATE int face_vert(int face, int k) const { return (int)tet[corner_of(face, k)]; }
-  // The face beside one, -1 for none.
+  PALPATE I* cells() const { return tet; }
+  // A face of the tetrahedron of a corner, 0 to 2, that has its vertex; the face beside one, -1 for none.
+  PALPATE int facet(int corner, int k) const { return other_corner(corner, k); }
   PALPATE int beside(int face) const { return triangle[face] >= 0 ? -1 : (int)mate[face]; }
   // How many neighbours a vertex has room for.
   PALPATE int room_of(int v) const {
@@ -77,54 +79,6 @@ PALPATE auto solid_of(const F& f) {
                   f.ring.data, f.degree.data, f.elem.data, f.of_tet.data, f.whole_tet.data,
                   f.whole_degree.data, f.mate.data, f.begin.data, f.around.data, f.seat.data,
                   f.triangle.data, f.most_spare};
-}
-
-// What is around vertices, in parts that hang together by faces that are not open: of each part its vertex,
-// its first corner, how many corners it has, and how it is called then.
-struct Parts {
-  int *vert, *first, *size, *name, count;
-  int *part;  // of a corner, from 1; 0 for those that are around none of the vertices
-  int *corner, ncorner, *queue;
-
-  PALPATE void clear() {
-    for (int i = 0; i < ncorner; ++i) part[corner[i]] = 0;
-    count = ncorner = 0;
-  }
-};
-
-PALPATE Parts parts_of(Scratch& memory, int ncorner) {
-  Parts out = {};
-  int** lists[] = {&out.vert, &out.first, &out.size, &out.name, &out.corner, &out.queue};
-  for (int i = 0; i < 6; ++i) *lists[i] = memory.room(ncorner);
-  out.part = memory.numbers(ncorner);
-  return out;
-}
-
-// Adds the parts around a vertex, those with lower corners first; `cut` marks faces that come apart.
-template <class S>
-PALPATE int find_parts(const S& m, int v, int from, const int* cut, Parts& out) {
-  const int begin = out.ncorner, had = out.count;
-  m.each_corner(v, from, [&](int corner) { out.corner[out.ncorner++] = corner; });
-  for (int i = begin; i < out.ncorner; ++i) {
-    if (out.part[out.corner[i]]) continue;
-    int queued = 0;
-    const int k = out.count++;
-    out.vert[k] = v, out.first[k] = out.corner[i], out.size[k] = 0;
-    out.queue[queued++] = out.corner[i];
-    out.part[out.corner[i]] = k + 1;
-    while (queued) {
-      const int corner = out.queue[--queued];
-      ++out.size[k];
-      for (int j = 0; j < 3; ++j) {
-        const int face = other_corner(corner, j), mate = cut[face] ? -1 : m.beside(face);
-        if (mate < 0) continue;
-        const int t = mate - mate % 4;
-        for (int c = t; c < t + 4; ++c)
-          if (m.tet[c] == v && !out.part[c]) out.part[c] = k + 1, out.queue[queued++] = c;
-      }
-    }
-  }
-  return out.count - had;
 }
 
 // The neighbours of a vertex, ascending; returns how many; `seen` is as long as there are vertices.
