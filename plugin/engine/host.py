@@ -53,6 +53,7 @@ class Host(host.Host):
     self.number, self._flags = body.numbers, wp.zeros(len(FLAG), dtype=int, device="cpu")
     self._rest = wp.array(self._from(), dtype=wp.float64, device="cpu")  # that of all `nodes`
     self._surface: dict[str, Any] = {}
+    self._there: dict[str, np.ndarray] = {}  # arrays of it
     self.bind(model)
 
   def bind(self, model: int):
@@ -95,8 +96,8 @@ class Host(host.Host):
     """Takes the organ that a cut has made, or a state that was set."""
     self.organ = organ
     self._rest.assign(self._from())
-    for name, values in self._meshes().items() if self._surface else ():
-      self._surface[name].assign(values)
+    for name, values in self._meshes().items() if self._there else ():
+      self._there[name][:] = values
 
   def _meshes(self) -> dict[str, np.ndarray]:
     mesh = self.organ.mesh
@@ -110,6 +111,7 @@ class Host(host.Host):
       self._surface = {"nelem": mesh.whole.nelem, "ntet": len(mesh.tet), "mesh": np.zeros(1)}
       for name, values in self._meshes().items():
         self._surface[name] = wp.array(values, dtype=kinds[name], device="cpu")
+        self._there[name] = self._surface[name].numpy()
     return self._surface
 
   def tools(self, name: str) -> np.ndarray:

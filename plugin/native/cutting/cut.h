@@ -187,13 +187,14 @@ template <class Fields>
 PALPATE void find_nearest(const Fields& f, Thread t, int) {
   if (t.tid) return;
   using I = decltype(f.elem.data[0] + 0);
-  const Triangles<I> all = {f.elem.data, f.x.data, f.rest.data, nullptr, f.nelem};
-  nearest_spots(all, f.point.data, f.npoint, f.edge, f.box.data, [&](int i, Spot s, const Triangles<I>& near) {
+  const Triangles<I> all = {f.elem.data, f.x.data, f.rest.data, nullptr, nullptr, f.nelem};
+  const auto put = [&](int i, Spot s, const Triangles<I>& near) {
     double* out = f.spot.data + 8 * i;
     out[0] = s.elem, out[4] = s.far;
     store(out + 1, s.weight);
     if (f.normals) store(out + 5, near.normal(s));
-  });
+  };
+  nearest_spots(all, f.point.data, f.npoint, f.edge, f.box.data, f.middle.data, put);
 }
 
 template <class Fields>

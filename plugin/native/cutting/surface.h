@@ -274,6 +274,7 @@ struct Triangles {
   const I* elem;
   const double *x, *rest;  // where vertices are, now and at rest
   const int* among;
+  const double* middles;  // of those of a list
   int count;
 
   PALPATE int of(int j) const { return among ? among[j] : j; }
@@ -299,7 +300,7 @@ struct Triangles {
     double least = 1e300;
     for (int j = 0; j < count; ++j) {
       const int t = of(j);
-      const D3 arm = middle(t) - p;
+      const D3 arm = (middles ? load(middles + 3 * j) : middle(t)) - p;
       const double far2 = dot(arm, arm), bound = out.far + tie + reach;
       if (far2 > bound * bound) continue;
       D3 x[3];
@@ -323,20 +324,24 @@ struct Triangles {
 };
 
 // Finds the spots that are nearest to points, which `put` gets with the triangles around: looked for in a box
-// around all points first, whose triangles `inside` gets.
+// around all points first, whose triangles and their middles `inside` and `middles` get.
 template <class I, class Put>
-PALPATE void nearest_spots(const Triangles<I>& all, const double* point, int n, double edge, int* inside, Put put) {
+PALPATE void nearest_spots(const Triangles<I>& all, const double* point, int n, double edge, int* inside,
+                           double* middles, Put put) {
   const Box box(point, n, BOX * edge);
   Triangles<I> near = all;
-  near.among = inside, near.count = 0;
-  for (int t = 0; t < all.count; ++t)
-    if (box.has(all.middle(t))) inside[near.count++] = t;
+  near.among = inside, near.middles = middles, near.count = 0;
+  for (int t = 0; t < all.count; ++t) {
+    if (!box.has(all.corner(t, 0))) continue;
+    store(middles + 3 * near.count, all.middle(t));
+    inside[near.count++] = t;
+  }
   const double reach = near.reach();
   double most = 0.0;  // of all
   for (int i = 0; i < n; ++i) {
     const D3 p = load(point + 3 * i);
     const Spot spot = near.nearest(p, TIE * edge, reach);
-    if (spot.far + reach < BOX * edge) {
+    if (spot.far + 2.0 * reach < BOX * edge) {
       put(i, spot, near);
       continue;
     }

@@ -29,6 +29,7 @@ class Nearest:
   rest: doubles("nvert", 3)  # where they are at rest [m]
   point: doubles("npoint", 3)
   box: ints("nelem")  # scratch
+  middle: doubles("nelem", 3)  # scratch
   spot: doubles("npoint", 8)  # triangle, weights of its corners, distance [m], normal at rest
 
 
@@ -45,19 +46,23 @@ class Finder:
   def __init__(self, whole: Mesh):
     self._fields = fields = Nearest()
     fields.nelem, fields.edge = whole.nelem, whole.edge_length
-    self._box, self._spot = np.zeros(whole.nelem, np.int32), np.zeros((16, 8))
+    self._box, self._middle = np.zeros(whole.nelem, np.int32), np.zeros((whole.nelem, 3))
+    self._make_room(32)
     self._launch = _nearest.command(fields).launch
+
+  def _make_room(self, n: int):
+    self._spot = np.zeros((n, 8))
+    aim(self._fields, box=self._box, middle=self._middle, spot=self._spot)
 
   def _find(
     self, mesh: Mesh, position: np.ndarray, points: np.ndarray, normals: bool
   ) -> np.ndarray:
     n = len(points)
     if n > len(self._spot):
-      self._spot = np.zeros((2 * n, 8))
-    given = {"x": position, "rest": mesh.rest, "point": points}
-    arrays = {name: np.ascontiguousarray(each, float) for name, each in given.items()}
-    arrays |= {"elem": np.ascontiguousarray(mesh.elem, np.int64), "box": self._box}
-    aim(self._fields, **arrays, spot=self._spot)
+      self._make_room(2 * n)
+    x, rest, point = (np.ascontiguousarray(each, float) for each in (position, mesh.rest, points))
+    elem = np.ascontiguousarray(mesh.elem, np.int64)
+    aim(self._fields, x=x, rest=rest, point=point, elem=elem)
     self._fields.npoint, self._fields.normals = n, normals
     self._launch()
     return self._spot[:n].copy()
