@@ -149,17 +149,20 @@ def test_an_organ_rests_on_what_does_not_move(device, still):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_a_touch_sensor_feels_its_own_body_alone(device):
+def test_a_sensor_feels_the_contacts_of_its_own_bodies_alone(device):
   points, elem = sphere(2)
   tissue = organ(points, elem, young=3e4, foundation=1e5, tolerance=1e-6, bend=0)
   tools = "".join(
-    f"""<body pos="{x} 0 {RADIUS + 0.0055}"><joint name="{name}" type="slide" axis="0 0 1"/>
-    <geom size="0.006" mass="0.05" condim="1"/><site name="{name}" size="0.05"/></body>"""
+    f"""<body name="{name}" pos="{x} 0 {RADIUS + 0.0055}"><joint name="{name}" type="slide"
+    axis="0 0 1"/><geom size="0.006" mass="0.05" condim="1"/><site name="{name}" size="0.05"/>
+    </body>"""
     for name, x in (("left", -0.001), ("right", 0.001))
   )
   extra = """<actuator><position joint="left" kp="500" kv="10"/><position joint="right" kp="500"
     kv="10"/></actuator>
-    <sensor><touch site="left"/><touch site="right"/></sensor>"""
+    <sensor><touch site="left"/><touch site="right"/>
+    <contact body1="left" data="force" reduce="netforce"/>
+    <contact body1="left" body2="right" data="force" reduce="netforce"/></sensor>"""
   made = world(tissue, tools, tolerance=1e-8, extra=extra)
   model, data, _ = load(made)
   batch = palpate.batch.make(mujoco.MjSpec.from_string(made), 2, device=device, nodes=24)
@@ -168,8 +171,12 @@ def test_a_touch_sensor_feels_its_own_body_alone(device):
   for _ in range(60):
     mujoco.mj_step(model, data)
     batch.step()
-  assert data.sensordata[0] > 0.02 and data.sensordata[1] == 0
-  np.testing.assert_allclose(batch.sensordata.numpy(), np.tile(data.sensordata, (2, 1)), rtol=0.02)
+  felt = data.sensordata
+  assert felt[0] > 0.02 and felt[1] == 0 and np.linalg.norm(felt[2:5]) > 0.02 and not felt[5:].any()
+  np.testing.assert_allclose(
+    batch.sensordata.numpy(), np.tile(felt, (2, 1)), rtol=0.02, atol=2e-4 * felt[0]
+  )
+  assert not batch.sensordata.numpy()[:, 5:].any()
 
 
 @pytest.mark.parametrize("device", DEVICES)
