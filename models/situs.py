@@ -289,7 +289,8 @@ def obstruct(
   """Lets the instruments of a scene, and nothing else, meet what is around.
 
   Organs and fat are balls in their inside, the wall is planes around it; shafts, which go through
-  the wall, do not meet that. `<instrument>/surroundings_force` is what an instrument exerts there.
+  the wall, do not meet that. What an instrument exerts there is in `tip_force` and `shaft_force`
+  too; `surroundings_tip` and `surroundings_shaft` tell it from what it exerts on tissue.
 
   Args:
     spec: changed in place, with its instruments
@@ -304,9 +305,7 @@ def obstruct(
   def add(on: mujoco.MjsBody, meets: int, **shape: Any) -> None:
     on.add_geom(contype=0, conaffinity=meets, group=_HIDDEN, mass=0, **_SOFT, **shape)
 
-  # A kidney is felt through the fat that it lies in: to brush that is part of the work.
-  firm = set(_BALLS) - ({"fat"} if around == "kidney" else set())
-  every = [(_balls(name), pos) for name, _, pos in _placed(organs, around, held) if name in firm]
+  every = [(_balls(name), pos) for name, _, pos in _placed(organs, around, held) if name in _BALLS]
   if more is not None:
     every.append((scenery.balls(more, _BALLS["fat"]), np.zeros(3)))
   for (centers, radii), pos in every:
@@ -338,15 +337,16 @@ def obstruct(
       shaft.contype |= _INSIDE
       for geom in [] if jaws else spec.body(f"{prefix}tip").geoms:
         geom.contype |= geom.contype and _INSIDE | _WITHIN
-      spec.add_sensor(
-        name=f"{prefix}{SURROUNDINGS}_force",
-        type=mujoco.mjtSensor.mjSENS_CONTACT,
-        objtype=mujoco.mjtObj.mjOBJ_XBODY,
-        objname=SURROUNDINGS,
-        reftype=mujoco.mjtObj.mjOBJ_XBODY,
-        refname=port.name,
-        intprm=[2, 3, 1],  # the force, of all contacts together
-      )
+      for name, kind in (("tip", mujoco.mjtObj.mjOBJ_XBODY), ("shaft", mujoco.mjtObj.mjOBJ_GEOM)):
+        spec.add_sensor(
+          name=f"{prefix}{SURROUNDINGS}_{name}",
+          type=mujoco.mjtSensor.mjSENS_CONTACT,
+          objtype=kind,
+          objname=prefix + name,
+          reftype=mujoco.mjtObj.mjOBJ_XBODY,
+          refname=SURROUNDINGS,
+          intprm=[2, 3, 1],  # the force, of all contacts together
+        )
 
 
 def _fat(x: np.ndarray, y: np.ndarray) -> np.ndarray:

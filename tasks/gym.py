@@ -6,9 +6,10 @@
 Observations are those of the exercise (see `observation`), a `Dict` of boxes. `terminated` is set
 by success and failure, `truncated` by the time limit, which is the task's, or `max_episode_steps`
 of `gymnasium.make` if that is less. `info` has `success`, `outcome` (None while it runs),
-`progress`, the largest forces of the step, `peak_force` and `shaft_force` [N], and, as constrained
-reinforcement learning has it, `cost`, at least 0: the sum of `cost_force`, `cost_shaft` and
-`cost_damage`, see `safety`. With ranges to `randomise` it has what was drawn as `randomised`; with
+`progress`, the largest forces of the step, `peak_force`, `shaft_force` and `surroundings_force`
+[N], and, as constrained reinforcement learning has it, `cost`, at least 0: the sum of `cost_force`,
+`cost_shaft`, `cost_surroundings` and `cost_damage`, see `safety`. With ranges to `randomise` it has
+what was drawn as `randomised`; with
 `record=True` the last step has `metrics`: the known skill metrics of the episode [SI] by name.
 
 Nothing is drawn before the first reset, so processes that an asynchronous vector forks can draw.
@@ -158,6 +159,7 @@ class Exercise(gymnasium.Env):
       "progress": float(self._task.progress),
       "peak_force": float(self._physics.peak_force),
       "shaft_force": float(self._physics.peak_shaft),
+      "surroundings_force": float(self._physics.peak_surroundings),
       "cost": self._task.cost.total,
       **{f"cost_{part}": value for part, value in vars(self._task.cost).items()},
     }

@@ -19,6 +19,7 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "force": (3,),
   "grip_force": (),
   "shaft_force": (),
+  "surroundings_force": (),
   "area": (),
   "strain": (),
   "grip": (),
@@ -35,7 +36,7 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "idle_current": (),
 }
 # Those that are measured faster: with substeps, magnitudes, one for each since the last sample.
-SIGNALS = ("force", "grip_force", "shaft_force")
+SIGNALS = ("force", "grip_force", "shaft_force", "surroundings_force")
 
 
 def measure(recording: Any, which: Sequence[int]) -> Metrics:

@@ -186,6 +186,7 @@ class Recorder:
     force: ArrayLike | None = None,
     grip_force: ArrayLike | None = None,
     shaft_force: ArrayLike | None = None,
+    surroundings_force: ArrayLike | None = None,
     strain: ArrayLike | Callable[[], float] | None = None,
     arrays: Mapping[str, ArrayLike] | None = None,
     **numbers: ArrayLike | None,
@@ -204,6 +205,8 @@ class Recorder:
         magnitudes since the last sample, evenly spaced, now the last  (substeps,), or one for all
       grip_force: of the jaw that presses more [N]  (), or (substeps,)
       shaft_force: magnitude of the contact force on the shaft [N]  (), or (substeps,)
+      surroundings_force: of that on what is around and is no part of the work [N]  (), or
+        (substeps,)
       strain: largest of the tissue, see `metrics.surface_strain`  (); or, with one instrument, what
         returns it, which is called by `settle`
       arrays: the caller's own, of any shape and number type, the same in every sample; arrays that
@@ -223,7 +226,8 @@ class Recorder:
     owed = strain if callable(strain) else None
     strain = strain if owed is None else math.nan
     given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force, "strain": strain}
-    given |= {"grip_force": grip_force, "shaft_force": shaft_force, **numbers}
+    given |= {"grip_force": grip_force, "shaft_force": shaft_force}
+    given |= {"surroundings_force": surroundings_force, **numbers}
     columns = {k: self._entry(k, v) for k, v in given.items() if v is not None}
     own = {name: self._own(name, value) for name, value in arrays.items()} if arrays else {}
     self._store(time, columns, own)

@@ -32,6 +32,7 @@ def exercise(steps=300, instruments=("left", "right"), seed=0, journal=None):
       force=force,
       grip_force=np.maximum(0, rng.randn(len(instruments))),
       shaft_force=np.maximum(0, rng.randn(len(instruments))),
+      surroundings_force=np.maximum(0, rng.randn(len(instruments))),
       strain=rng.rand(len(instruments)),
       area=np.full(len(instruments), 2e-5),
       freed=np.full(len(instruments), k / steps),

@@ -36,9 +36,8 @@ class Common:
   low: floats(5)  # of the controls, jaw last
   high: floats(5)
   move: floats(4)  # what an action of 1 adds to the drives' targets [rad, m]
-  sensor: ints(4)  # tip and shaft force, force on the left and right jaw
-  sensoradr: ints(4)
-  around: int  # sensor of the force on what is around, -1 where nothing is
+  sensoradr: ints(4)  # of tip and shaft force, force on the left and right jaw
+  around: int  # first number of the sensors of that on what is around, -1 where nothing is
   elem: ints("nelem", 3)
   coarse: ints(COARSE)  # nodes of `surface`
   coarse0: Array(wp.vec3, (COARSE,))
@@ -47,7 +46,7 @@ class Common:
   qvel: floats("nworld", "nv")
   ctrl: floats("nworld", "nu")
   sensordata: floats("nworld", "nsensordata")
-  sensor_peak: floats("nworld", "nsensor")
+  sensor_steps: floats("nworld", "nstep", "nsensordata")  # in each step of the physics
   sensor_mean: floats("nworld", "nsensordata")
   failures: ints("nworld")
   xpos: floats("nworld", "nvert", 3)
@@ -71,7 +70,7 @@ class Common:
   # Of the other hand.
   other_tip_pos: floats("nworld", 3)
   other_tip_quat: floats("nworld", 4)
-  other_contact_force: floats("nworld", 3)
+  other_tissue_force: floats("nworld", 3)
   # Drawn for an episode.
   body_pos: floats("nworld", 3)  # of the trocar in the world [m]
   body_quat: floats("nworld", 4)  # w x y z
@@ -90,8 +89,11 @@ class Common:
   cost: floats("nworld")  # and its parts, see `safety`
   cost_force: floats("nworld")
   cost_shaft: floats("nworld")
+  cost_surroundings: floats("nworld")
   cost_damage: floats("nworld")
-  shaft_peak: floats("nworld")  # [N]
+  tissue_peak: floats("nworld")  # largest force of a control step, see `Instrument` [N]
+  shaft_peak: floats("nworld")
+  around_peak: floats("nworld")
   errors: ints("nworld")  # misses, drops, contacts of the shaft
   targets: ints("nworld")  # that were reached
   missed_by: floats("nworld")  # sum of the distances from these [m]
@@ -107,6 +109,7 @@ class Common:
   tip_quat: floats("nworld", 4)
   tip_vel: floats("nworld", 3)
   contact_force: floats("nworld", 3)
+  tissue_force: floats("nworld", 3)
   shaft_force: floats("nworld", 3)
   peak_force: floats("nworld", 1)
   gripper: floats("nworld", 4)
@@ -121,4 +124,9 @@ OBSERVED = {"drive": "drive_error"}
 INFO = {
   name: name
   for name in ("success", "outcome", "progress", "peak_force", "cost", "cost_force", "cost_shaft")
-} | {"cost_damage": "cost_damage", "shaft_force": "shaft_peak"}
+} | {
+  "cost_surroundings": "cost_surroundings",
+  "cost_damage": "cost_damage",
+  "shaft_force": "shaft_peak",
+  "surroundings_force": "around_peak",
+}

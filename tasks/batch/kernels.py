@@ -3,7 +3,6 @@
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
 from palpate.tasks.core import base, jaws, safety
-from palpate.tasks.core.instrument import BRUSH
 from palpate.tasks.core.physics import NEAR
 from palpate.tasks.core.rules import closeness as _closeness
 from palpate.tissue.types import Array, floats, ints, struct
@@ -15,7 +14,6 @@ closeness, parts = wp.func(_closeness), wp.func(safety.parts)
 _SHARE, _PRICE = wp.constant(base.SHARE), wp.constant(base.PRICE)
 _MOST = wp.constant(base.MOST)
 _SLACK = wp.constant(base.SLACK)
-_BRUSH = wp.constant(BRUSH)
 _NEAR, _FACING = wp.constant(NEAR), wp.constant(jaws.FACING)
 _distances = wp.types.vector(length=NEAR, dtype=float)
 _numbers = wp.types.vector(length=NEAR, dtype=int)
@@ -107,12 +105,31 @@ def begin(s: Common):
   s.cost[w] = 0.0
   s.cost_force[w] = 0.0
   s.cost_shaft[w] = 0.0
+  s.cost_surroundings[w] = 0.0
   s.cost_damage[w] = 0.0
   s.errors[w] = 0
   s.targets[w] = 0
   s.missed_by[w] = 0.0
   s.grasps[w] = 0
   s.slips[w] = 0
+
+
+@wp.func
+def _sensor(s: Common, w: int, k: int, adr: int):
+  """Returns a sensor of three numbers in a step of the physics."""
+  x = s.sensor_steps
+  return wp.vec3(x[w, k, adr], x[w, k, adr + 1], x[w, k, adr + 2])
+
+
+@wp.func
+def forces(s: Common, w: int, k: int):
+  """Returns the force of tissue on tip and shaft, and that on what is around, in a step [N]."""
+  tip, shaft = _sensor(s, w, k, s.sensoradr[0]), _sensor(s, w, k, s.sensoradr[1])
+  around = wp.vec3()
+  if s.around >= 0:
+    by_tip, by_shaft = _sensor(s, w, k, s.around), _sensor(s, w, k, s.around + 3)
+    tip, shaft, around = tip - by_tip, shaft - by_shaft, by_tip + by_shaft
+  return wp.vec3(wp.length(tip), wp.length(shaft), wp.length(around))
 
 
 @wp.kernel(enable_backward=False)
@@ -126,29 +143,35 @@ def measure(s: Common, beginning: bool):
     s.joint_vel[w, k] = s.qvel[w, s.dofadr[k]]
     s.drive_error[w, k] = s.ctrl[w, s.drive[k]] - s.joints[w, k]
   place(s, w)
-  most = wp.float32(0.0)
-  shaft = wp.float32(0.0)
+  felt = wp.float32(0.0)
+  most = wp.vec3()
   for k in range(3):
     s.contact_force[w, k] = 0.0
+    s.tissue_force[w, k] = 0.0
     s.shaft_force[w, k] = 0.0
   if not beginning:
     for k in range(3):
       s.contact_force[w, k] = -s.sensordata[w, s.sensoradr[0] + k]
+      s.tissue_force[w, k] = s.contact_force[w, k]
+      if s.around >= 0:
+        s.tissue_force[w, k] = s.contact_force[w, k] + s.sensordata[w, s.around + k]
       s.shaft_force[w, k] = -s.sensordata[w, s.sensoradr[1] + k]
-    most = s.sensor_peak[w, s.sensor[0]]
-    shaft = s.sensor_peak[w, s.sensor[1]]
-    if s.around >= 0:
-      shaft = wp.max(shaft, s.sensor_peak[w, s.around] - _BRUSH)
+    for k in range(s.sensor_steps.shape[1]):
+      felt = wp.max(felt, wp.length(_sensor(s, w, k, s.sensoradr[0])))
+      most = wp.max(most, forces(s, w, k))
+  grip = wp.float32(0.0)
   if s.jaw >= 0:
     for k in range(2):
       s.gripper[w, 2 + k] = 0.0
       if not beginning:
         s.gripper[w, 2 + k] = s.sensordata[w, s.sensoradr[2 + k]]
-        most = wp.max(most, s.sensor_mean[w, s.sensoradr[2 + k]])
+        grip = wp.max(grip, s.sensor_mean[w, s.sensoradr[2 + k]])
     s.gripper[w, 0] = s.qpos[w, s.opening] + s.qpos[w, s.opening + 1]
     s.gripper[w, 1] = s.ctrl[w, s.jaw]
-  s.peak_force[w, 0] = most
-  s.shaft_peak[w] = shaft
+  s.peak_force[w, 0] = wp.max(felt, grip)
+  s.tissue_peak[w] = wp.max(most[0], grip)
+  s.shaft_peak[w] = most[1]
+  s.around_peak[w] = most[2]
 
 
 @wp.kernel(enable_backward=False)
@@ -156,7 +179,9 @@ def join(s: Common, other: Common):
   """Takes the largest forces of both hands."""
   w = wp.tid()
   s.peak_force[w, 0] = wp.max(s.peak_force[w, 0], other.peak_force[w, 0])
+  s.tissue_peak[w] = wp.max(s.tissue_peak[w], other.tissue_peak[w])
   s.shaft_peak[w] = wp.max(s.shaft_peak[w], other.shaft_peak[w])
+  s.around_peak[w] = wp.max(s.around_peak[w], other.around_peak[w])
 
 
 @wp.func
@@ -199,14 +224,18 @@ def reach(s: Common, w: int, distance: float):
 @wp.func
 def judge(s: Common, w: int, progress: float, outcome: int):
   """Ends a control step that came to a progress and an outcome; a success is all of it."""
-  peak, shaft = s.peak_force[w, 0], s.shaft_peak[w]
-  over, lies, harmed = parts(peak, shaft, s.force_limit, s.damage)
+  over, lies, pushes, harmed = parts(
+    s.tissue_peak[w], s.shaft_peak[w], s.around_peak[w], s.force_limit, s.damage
+  )
   if lies > 0.0 and s.cost_shaft[w] == 0.0:
     error(s, w)
-  total = over + lies + harmed
+  if pushes > 0.0 and s.cost_surroundings[w] == 0.0:
+    error(s, w)
+  total = over + lies + pushes + harmed
   s.cost[w] = total
   s.cost_force[w] = over
   s.cost_shaft[w] = lies
+  s.cost_surroundings[w] = pushes
   s.cost_damage[w] = harmed
   found = outcome
   now = progress

@@ -14,14 +14,14 @@ from palpate.tasks.metrics import force as pressing
 from palpate.tissue.types import Array, doubles, floats, ints, struct
 
 from .fields import Common
-from .kernels import vector
+from .kernels import forces, vector
 
 NAMES = (
   "time", "path_length", "mean_speed", "peak_speed", "contact_speed", "economy_of_volume",
   "path_inefficiency",
   "depth_path", "angular_path", "response_orientation", "errors", "target_error",
   "peak_force", "mean_force", "rms_force", "force_time_product", "force_breaches",
-  "excess_impulse", "shaft_contact", "peak_shaft_force",
+  "excess_impulse", "shaft_contact", "peak_shaft_force", "peak_surroundings_force",
   "peak_grip", "mean_grip", "grip_breaches", "grip_ratio", "grasp_slips",
 )  # fmt: skip
 M = enum.IntEnum("M", NAMES, start=0)  # columns of `Tally.values`
@@ -37,7 +37,6 @@ class Tally:
   contact: float  # force above which there is contact [N]
   limit: float  # of force and grip [N]
   h: wp.float64  # step of the physics [s]
-  sensor_steps: floats("nworld", "nstep", "nsensordata")
   values: floats("nworld", len(NAMES))
   pos: floats("nworld", 3)  # of the tip, a control step ago [m]
   quat: floats("nworld", 4)
@@ -60,6 +59,7 @@ class Tally:
   shaft_peak: doubles("nworld")  # [N]
   shaft_last: doubles("nworld")  # [N]
   shaft_time: doubles("nworld")  # [s]
+  around_peak: doubles("nworld")  # on what is around [N]
   pulled: doubles("nworld")  # impulse of the tip while the jaws grip [N s]
   gripped: doubles("nworld")  # impulse of the grip meanwhile [N s]
 
@@ -84,6 +84,7 @@ def start(s: Common, t: Tally):
   t.shaft_peak[w] = zero
   t.shaft_last[w] = zero
   t.shaft_time[w] = zero
+  t.around_peak[w] = zero
   t.pulled[w] = zero
   t.gripped[w] = zero
   for q in range(2):
@@ -160,28 +161,23 @@ def _press(t: Tally, w: int, q: int, force: float):
   t.last[w, q] = f
 
 
-@wp.func
-def _norm(t: Tally, w: int, k: int, adr: int):
-  """Returns the norm of a sensor of three numbers."""
-  x = t.sensor_steps
-  return wp.length(wp.vec3(x[w, k, adr], x[w, k, adr + 1], x[w, k, adr + 2]))
-
-
 @wp.kernel(enable_backward=False)
 def add(s: Common, t: Tally):
   """Adds a control step."""
   w = wp.tid()
   far = _move(s, t, w)
   touched = t.touched[w, _TIP]
-  for k in range(t.sensor_steps.shape[1]):
-    force, shaft = _norm(t, w, k, s.sensoradr[0]), _norm(t, w, k, s.sensoradr[1])
+  for k in range(s.sensor_steps.shape[1]):
+    found = forces(s, w, k)
+    force, shaft = found[0], found[1]
+    t.around_peak[w] = wp.max(t.around_peak[w], wp.float64(found[2]))
     _press(t, w, _TIP, force)
     t.shaft_last[w] = wp.float64(shaft)
     t.shaft_peak[w] = wp.max(t.shaft_peak[w], wp.float64(shaft))
     if shaft > t.contact:
       t.shaft_time[w] = t.shaft_time[w] + t.h
     if s.jaw >= 0:
-      grip = wp.max(t.sensor_steps[w, k, s.sensoradr[2]], t.sensor_steps[w, k, s.sensoradr[3]])
+      grip = wp.max(s.sensor_steps[w, k, s.sensoradr[2]], s.sensor_steps[w, k, s.sensoradr[3]])
       _press(t, w, _GRIP, grip)
       if force > t.contact and grip > t.contact:
         t.pulled[w] = t.pulled[w] + t.h * wp.float64(force)
@@ -246,6 +242,7 @@ def _tell(s: Common, t: Tally, w: int):
   lies = wp.where(t.shaft_last[w] > wp.float64(t.contact), wp.float64(0.5) * t.h, wp.float64(0.0))
   t.values[w, M.shaft_contact] = float(t.shaft_time[w] - lies)
   t.values[w, M.peak_shaft_force] = float(t.shaft_peak[w])
+  t.values[w, M.peak_surroundings_force] = wp.where(s.around >= 0, float(t.around_peak[w]), wp.nan)
   _tell_force(t, w, _GRIP, M.peak_grip, M.mean_grip, M.grip_breaches)
   end = wp.min(_end(t, w, _TIP), _end(t, w, _GRIP))
   gripped = t.gripped[w] - end * t.last[w, _GRIP]

@@ -60,13 +60,13 @@ def normal(s: Common, triangle: int):
 @word
 def peak(s: Common):
   """See `rules`."""
-  return s.peak_force[s.world, 0]
+  return s.tissue_peak[s.world]
 
 
 @word
 def force(s: Common):
   """See `rules`."""
-  return wp.length(kernels.vector(s.contact_force, s.world))
+  return wp.length(kernels.vector(s.tissue_force, s.world))
 
 
 @word
@@ -90,7 +90,7 @@ def other_point(s: Common, place: wp.vec3):
 @word
 def other_force(s: Common):
   """See `rules`."""
-  return wp.length(kernels.vector(s.other_contact_force, s.world))
+  return wp.length(kernels.vector(s.other_tissue_force, s.world))
 
 
 @word

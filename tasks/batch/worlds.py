@@ -16,7 +16,7 @@ from palpate.batch.threads import Threads
 from palpate.models import trocar
 from palpate.tasks.core import episode, jaws
 from palpate.tasks.core.environment import Environment
-from palpate.tasks.core.instrument import AROUND, AXES, JAWS, RATES
+from palpate.tasks.core.instrument import AROUND, AXES, FORCES, JAWS, RATES, TOUCH
 from palpate.tasks.core.stage import STATE
 from palpate.tissue.types import allocate
 
@@ -24,8 +24,6 @@ from . import kernels, tally
 from .episodes import FRAME, HAND, Episodes, at_rest, of_hand
 from .fields import OBSERVED, Common
 from .states import States
-
-_SENSORS = ("tip_force", "shaft_force", "touch_left", "touch_right")
 
 
 class Worlds:
@@ -73,19 +71,19 @@ class Worlds:
     self.episodes = Episodes(task, self.states.draw, nworld)
     self.organ, self._tissue = self.batch.organ(task.organ), tuple(task.tissue())
     dt = environment.control_timestep()
+    self._steps = self.batch.watch(self._substeps)
     self.fields, self.other = self._make(task, task.prefix, dt, limit), None
     if task.second:
       self.other = self._make(task, task.second, dt, limit)
       self.other.first = len(task.components) - len(AXES) - len(task.other)
       for name in ("action", "begun", "step"):
         setattr(self.other, name, getattr(self.fields, name))
-      for name in ("tip_pos", "tip_quat", "contact_force"):
+      for name in ("tip_pos", "tip_quat", "tissue_force"):
         setattr(self.fields, f"other_{name}", getattr(self.other, name))
     if self.fields.cutter_inside.shape[1]:
       self.batch.feel(f"{task.prefix}tip_force", task.organ)
-    steps = self.batch.watch(self._substeps)
-    self.tally = self._count(task, steps)
-    self._tally = self._count(task, steps) if self.other else None
+    self.tally = self._count(task)
+    self._tally = self._count(task) if self.other else None
     self._hows = tally.hows(self.device)
     self._bad = wp.zeros(1, dtype=int, device=self.device)
     self._done, self._graphs = set[str](), dict[str, Any]()
@@ -108,7 +106,7 @@ class Worlds:
     physics, model = self.episodes.physics, self.batch.model
     sizes = dict(
       nworld=self.nworld, nvert=self.organ.nvert, nelem=len(self.organ.elem), nq=model.nq,
-      nv=model.nv, nu=model.nu, nsensor=model.nsensor, nsensordata=model.nsensordata,
+      nv=model.nv, nu=model.nu, nsensordata=model.nsensordata, nstep=self._substeps,
       naction=len(task.components), nside=model.ngeom + 1,
       nspot=len(getattr(task, "disc", ())), nbond=len(physics.organ.bonds),
       ncutter=len(physics.organ.cutters),
@@ -137,18 +135,15 @@ class Worlds:
       s.disc, s.eye = self.states.rows["disc"], wp.vec3(*physics.camera()[0])
     batch = self.batch
     s.ctrl, s.failures = batch.ctrl, batch.failures
-    s.sensor_peak, s.sensor_mean = batch.sensor_peak, batch.sensor_mean
+    s.sensor_mean, s.sensor_steps = batch.sensor_mean, self._steps
     self._read(s)
     return s
 
-  def _count(self, task: Any, steps: wp.array) -> Any:
-    """Returns the sums that metrics are made of, of the sensors of these steps."""
-    sizes = dict(
-      nworld=self.nworld, nstep=self._substeps, nsensordata=self.batch.model.nsensordata
-    )  # fmt: skip
-    t = allocate(tally.Tally, self.device, sizes)
+  def _count(self, task: Any) -> Any:
+    """Returns the sums that metrics are made of."""
+    t = allocate(tally.Tally, self.device, {"nworld": self.nworld})
     t.contact, t.limit = task.settings().contact_force, task.force_limit
-    t.h, t.sensor_steps = self.batch.model.opt.timestep, steps
+    t.h = self.batch.model.opt.timestep
     return t
 
   @staticmethod
@@ -160,11 +155,10 @@ class Worlds:
     s.dofadr.assign(np.array([int(joint.dofadr[0]) for joint in joints]))
     s.jaw = model.actuator(f"{prefix}jaw").id if jaws else -1
     s.opening = int(model.joint(f"{prefix}jaw_left").qposadr[0]) if jaws else -1
-    sensors = [model.sensor(prefix + n).id for n in _SENSORS[: 4 if jaws else 2]]
-    sensors += [0] * (4 - len(sensors))
-    s.sensor.assign(np.array(sensors))
-    s.sensoradr.assign(model.sensor_adr[sensors])
-    s.around = mj.mj_name2id(model, mj.mjtObj.mjOBJ_SENSOR, prefix + AROUND)
+    sensors = [model.sensor(prefix + n).id for n in (*FORCES, *(TOUCH if jaws else ()))]
+    s.sensoradr.assign(model.sensor_adr[sensors + [0] * (4 - len(sensors))])
+    around = mj.mj_name2id(model, mj.mjtObj.mjOBJ_SENSOR, prefix + AROUND[0])
+    s.around = int(model.sensor_adr[around]) if around >= 0 else -1  # the shaft's follows
 
   def _read(self, s: Any) -> None:
     """Brings what is of the batch up to date."""

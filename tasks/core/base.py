@@ -358,16 +358,20 @@ class Task(engine.Task):
 
   def after_step(self, physics: Physics) -> None:
     """Measures the progress and looks for errors and damage."""
-    self.peak = max(self.peak, physics.peak_force)
+    self.peak = max(self.peak, physics.peak_tissue)
     self.progress = self.advance(physics)
-    tip, shaft, lay = physics.peak_force, physics.peak_shaft, self.cost.shaft > 0
-    self.cost = safety.cost(tip, shaft, self.force_limit, self.damage)
-    if self.cost.shaft and not lay:
-      self.event(physics, "unintended_contact", shaft, label=physics.strayed)
+    tip, before = physics.peak_tissue, self.cost
+    beside = {"shaft": physics.peak_shaft, "surroundings": physics.peak_surroundings}
+    self.cost = safety.cost(tip, *beside.values(), self.force_limit, self.damage)
+    for where, force in beside.items():
+      if getattr(self.cost, where) and not getattr(before, where):
+        self.event(physics, "unintended_contact", force, label=where)
     if self.cost.damage:
       self.outcome, self.progress = "damage", -1.0
-      what = "damage" if tip > self.damage else f"damage by the {physics.strayed}"
-      self.event(physics, "note", label=f"{what}: {tip if tip > self.damage else shaft:.2f} N")
+      where = max(beside, key=lambda name: beside[name])
+      by = "" if tip > self.damage else f" by the {where}"
+      force = tip if tip > self.damage else beside[where]
+      self.event(physics, "note", label=f"damage{by}: {force:.2f} N")
     elif self.outcome == "success":
       self.event(physics, "note", label="success")
     phi = self.progress if self.outcome in ("success", "damage") else SHARE * self.progress

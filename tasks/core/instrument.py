@@ -15,8 +15,8 @@ from .jaws import Jaws
 AXES = ("pitch", "yaw", "roll", "insertion")
 JAWS = "grasper/"  # prefix of the instrument that has them
 TOUCH = ("touch_left", "touch_right")  # sensors of the jaws
-BRUSH = 0.2  # force with which an instrument may brush along what is around [N]
-AROUND = f"{situs.SURROUNDINGS}_force"  # sensor of what an instrument exerts on what is around
+FORCES = ("tip_force", "shaft_force")  # sensors of what an instrument exerts
+AROUND = tuple(f"{situs.SURROUNDINGS}_{part}" for part in ("tip", "shaft"))  # and of that around
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
 
@@ -36,9 +36,9 @@ class Instrument:
     handle: that pulls it, None where position drives move it
     guide: takes the handle along an action
     peak_force: largest force since the last control step, or a jaw's mean if that is more [N]
-    peak_shaft: largest force where none is meant since then: on the shaft, or what exceeds BRUSH
-      on what is around [N]
-    strayed: where that was, "shaft" or "surroundings"
+    peak_tissue: the same of tissue alone [N]
+    peak_shaft: largest force of tissue on the shaft since then [N]
+    peak_surroundings: largest force since then on what is around [N]
     edge: force of its edges on tissue that they cut [N]  (3,)
   """
 
@@ -67,7 +67,7 @@ class Instrument:
     self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
     self._jaws = Jaws(model, prefix) if self.has_jaw else None
     self._inner = np.zeros(2)
-    self._forced = [n for n in ("tip_force", "shaft_force", AROUND) if n in self._sensors]
+    self._forced = [n for n in (*FORCES, *AROUND) if n in self._sensors]
     signals = [*self._forced, *(TOUCH if self.has_jaw else ())]
     self._signals = np.concatenate([np.arange(*self._sensors[n].indices(10**6)) for n in signals])
     self._trocar = trocar.trocar(model, prefix)
@@ -106,16 +106,22 @@ class Instrument:
     return self.handle.joints(self._trocar) if self.handle else self.data.ptr.ctrl[self.drives]
 
   def contact_force(self) -> np.ndarray:
-    """Returns the force of the tissue on the instrument below the shaft [N]  (3,)."""
+    """Returns the force on the instrument below the shaft [N]  (3,)."""
     return -self.sensor("tip_force") - self.edge
+
+  def tissue_force(self) -> np.ndarray:
+    """Returns the part of `contact_force` that is of tissue [N]  (3,)."""
+    around = self.sensor(AROUND[0]) if AROUND[0] in self._sensors else 0.0
+    return self.contact_force() + around
 
   def shaft_force(self) -> np.ndarray:
     """Returns the contact force on the shaft [N]  (3,)."""
     return -self.sensor("shaft_force")
 
   def forces(self) -> dict[str, np.ndarray]:
-    """Returns the force of the tip, the shaft and the jaws' grip in each step of the last `step`.
+    """Returns the forces in each step of the last `step`.
 
+    Those of tissue on tip and shaft, of the jaws' grip, and on what is around, if there is any.
     Magnitudes [N]  (nstep,), as `Recorder.append` takes them; a single 0 before the first.
     """
     return dict(self._forces)
@@ -235,22 +241,34 @@ class Instrument:
     values = sensors[:, self._signals]
     count = len(self._forced)
     parts = values[:, : 3 * count].reshape(-1, count, 3)
-    tip, shaft, *around = np.sqrt(np.einsum("ijk,ijk->ji", parts, parts))
+    self.peak_force = float(_norm(parts[:, 0]).max())
+    tissue, around = parts[:, :2], parts[:, 2:]
+    if around.size:
+      tissue = tissue - around
+    tip, shaft = _norm(tissue).T
     self._forces = {"force": tip, "shaft_force": shaft}
-    self.peak_force, self.peak_shaft, self.strayed = float(tip.max()), float(shaft.max()), "shaft"
-    if around and around[0].max() - BRUSH > self.peak_shaft:
-      self.peak_shaft, self.strayed = float(around[0].max()) - BRUSH, situs.SURROUNDINGS
+    self.peak_tissue, self.peak_shaft = float(tip.max()), float(shaft.max())
+    self.peak_surroundings = 0.0
+    if around.size:
+      self._forces["surroundings_force"] = outside = _norm(around.sum(axis=1))
+      self.peak_surroundings = float(outside.max())
     if self.has_jaw:
       jaws = values[:, 3 * count :]
       self._forces["grip_force"] = jaws.max(axis=1)
       # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
-      self.peak_force = max(self.peak_force, float(jaws.sum(axis=0).max()) / len(jaws))
+      grip = float(jaws.sum(axis=0).max()) / len(jaws)
+      self.peak_force, self.peak_tissue = max(self.peak_force, grip), max(self.peak_tissue, grip)
 
   def quiet(self) -> None:
     """Forgets the forces of the last steps: they would be in the next episode's start."""
     self.edge = np.zeros(3)
     self.begin(1)
     self.keep(np.zeros((1, self.model.nsensordata)))
+
+
+def _norm(vectors: np.ndarray) -> np.ndarray:
+  """Returns the lengths of vectors, which are in the last axis."""
+  return np.sqrt(np.einsum("...k,...k->...", vectors, vectors))
 
 
 class Second(Instrument):

@@ -108,9 +108,8 @@ class Physics(Instrument, Portable):
   def _join(self) -> None:
     """Takes the largest forces of both hands."""
     if self.second:
-      self.peak_force = max(self.peak_force, self.second.peak_force)
-      if self.second.peak_shaft > self.peak_shaft:
-        self.peak_shaft, self.strayed = self.second.peak_shaft, self.second.strayed
+      for name in ("peak_force", "peak_tissue", "peak_shaft", "peak_surroundings"):
+        setattr(self, name, max(getattr(self, name), getattr(self.second, name)))
 
   def resume(self, data: mj.MjData, rest: dict[str, Any], config: Config) -> None:
     """See `Portable`."""

@@ -157,13 +157,13 @@ def normal(s: Any, triangle: int) -> np.ndarray:
 
 
 def peak(s: Any) -> float:
-  """Returns the largest force of the control step, jaws included [N]."""
-  return s.peak_force
+  """Returns the largest force of tissue in the control step, jaws included [N]."""
+  return s.peak_tissue
 
 
 def force(s: Any) -> float:
-  """Returns the force on the instrument below the shaft [N]."""
-  return length(s.contact_force())
+  """Returns the force of tissue on the instrument below the shaft [N]."""
+  return length(s.tissue_force())
 
 
 def from_tip(s: Any, place: np.ndarray) -> np.ndarray:
@@ -202,8 +202,8 @@ def other_point(s: Any, place: np.ndarray) -> np.ndarray:
 
 
 def other_force(s: Any) -> float:
-  """Returns the force on that instrument below the shaft [N]."""
-  return length(s.second.contact_force())
+  """Returns the force of tissue on that instrument below the shaft [N]."""
+  return length(s.second.tissue_force())
 
 
 def bonds(s: Any) -> int:

@@ -215,6 +215,15 @@ def peak_shaft_force(shaft_force: ArrayLike) -> float:
   return magnitude(shaft_force).max()
 
 
+@metric("Peak force on surroundings", "N", "safety", "max", _SHAFT)
+def peak_surroundings_force(surroundings_force: ArrayLike) -> float:
+  """Returns the largest force on what is around [N], lower is better; 0 where there was none.
+
+  As `peak_shaft_force`, of organs that are no part of the work, fat and the wall.
+  """
+  return magnitude(surroundings_force).max()
+
+
 @metric("Peak traction", "N", "safety", "max", "as peak force: Horeman et al. 2010")
 def peak_traction(traction: ArrayLike) -> float:
   """Returns the largest pull on what an organ is bonded to [N], lower is better.

@@ -177,11 +177,30 @@ def test_damage_and_its_cost_are_those_of_the_single_environment():
       break
   final = info["final_info"]
   assert final["outcome"][0] == said["outcome"] == "damage"
-  for name in ("cost", "cost_force", "cost_shaft", "cost_damage"):
+  for name in ("cost", "cost_force", "cost_shaft", "cost_surroundings", "cost_damage"):
     assert final[name][0] == pytest.approx(said[name], abs=1e-3)
   compare_metrics(final["metrics"], 0, said["metrics"])
   assert final["metrics"]["force_breaches"][0] == 1
   assert final["metrics"]["excess_impulse"][0] > 0
+
+
+def test_what_is_around_is_told_from_tissue_as_in_the_single_environment():
+  """It is felt and costs, but is no contact: no speed in contact comes of it, and no mean force."""
+  options = {"surroundings": "unseen", "time_limit": 1.2}
+  env, alone = make("touch/easy", 1, **options), single("touch/easy", record=True, **options)
+  env.reset(seed=0)
+  alone.reset(seed=0)
+  aside, over, cost = np.array([[0.5, 0.5, 0.0, 0.5]]), False, 0.0
+  while not over:
+    *_, over, info = env.step(aside)
+    *_, said = alone.step(aside[0])
+    cost = max(cost, said["cost_surroundings"])
+  final, expected = info["final_info"], said["metrics"]
+  for name in ("cost", "cost_shaft", "cost_surroundings", "surroundings_force"):
+    assert final[name][0] == pytest.approx(said[name], abs=0.02), name
+  assert cost > 0 == said["cost_shaft"] and expected["errors"] == 1
+  compare_metrics(final["metrics"], 0, expected)
+  assert expected["peak_surroundings_force"] > 0.3 and "contact_speed" not in expected
 
 
 # Gymnasium.

@@ -40,6 +40,7 @@ class Beside:
     self.physics.place(state)
     self.physics.data.sensordata[:] = batch.sensordata.numpy()[self.world]
     self.physics.peak_force = float(shown.peak_force.numpy()[self.world, 0])
+    self.physics.peak_tissue = float(shown.tissue_peak.numpy()[self.world])
     self.physics.peak_shaft = float(shown.shaft_peak.numpy()[self.world])
 
   def holds(self):

@@ -23,6 +23,7 @@ _ADVICE = {
   "mean_grip": "close the jaws only until they hold",
   "shaft_contact": "keep the shaft away from the organ; look at more than the tip",
   "peak_shaft_force": "keep the shaft away from the organ; look at more than the tip",
+  "peak_surroundings_force": "go around what is not yours to touch",
   "time": "plan the next movement during the present one",
   "path_length": "go straight to the target",
   "path_inefficiency": "go straight to the target",
@@ -86,13 +87,13 @@ class Coach:
     self._say("hint", self._now, text)
 
   def _warning(self, task: Any, physics: Any) -> tuple[str, str]:
-    peak, limit = physics.peak_force, task.force_limit
+    peak, limit = physics.peak_tissue, task.force_limit
     if peak > limit:
       return "force", f"Too much force: {peak:.1f} N, expected at most {limit:.1f} N"
     if task.cost.shaft:
-      shaft = physics.strayed == "shaft"
-      what = "The shaft presses on the organ" if shaft else "You press on what is around"
-      return "shaft", f"{what} with {physics.peak_shaft:.1f} N"
+      return "shaft", f"The shaft presses on the organ with {physics.peak_shaft:.1f} N"
+    if task.cost.surroundings:
+      return "shaft", f"You press on what is around with {physics.peak_surroundings:.1f} N"
     if not physics.tip_visible():
       return "view", "The tip is out of the picture"
     return "", ""

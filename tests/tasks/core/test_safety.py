@@ -28,16 +28,19 @@ def on(physics, tip):
 
 
 def test_cost_is_the_sum_of_its_parts():
-  assert safety.cost(1.5, 0.04, 1.5, 3.0).total == 0
-  over = safety.cost(3.0, 0.0, 1.5, 3.0)
+  assert safety.cost(1.5, 0.04, 0.2, 1.5, 3.0).total == 0
+  over = safety.cost(3.0, 0.0, 0.0, 1.5, 3.0)
   assert (over.force, over.shaft, over.damage, over.total) == (1, 0, 0, 1)
-  shaft = safety.cost(0.0, 0.75, 1.5, 3.0)
+  shaft = safety.cost(0.0, 0.75, 0.0, 1.5, 3.0)
   assert (shaft.force, shaft.shaft, shaft.damage, shaft.total) == (0, 0.5, 0, 0.5)
-  both = safety.cost(3.2, 3.1, 1.5, 3.0)
+  both = safety.cost(3.2, 3.1, 0.0, 1.5, 3.0)
   assert both.damage == both.shaft == 1 and both.total == pytest.approx(2 + 3.2 / 1.5 - 1)
+  around = safety.cost(0.0, 0.0, 0.75, 1.5, 3.0)
+  assert (around.surroundings, around.total) == (0.5, 0.5)
+  assert safety.cost(0.0, 0.0, 3.5, 1.5, 3.0).damage == 1
   # The limits of jaws are not those of a shaft.
-  assert safety.cost(3.5, 0.0, 4.0, 8.0).total == 0
-  assert safety.cost(0.0, 3.5, 4.0, 8.0).damage == 1
+  assert safety.cost(3.5, 0.0, 0.0, 4.0, 8.0).total == 0
+  assert safety.cost(0.0, 3.5, 0.0, 4.0, 8.0).damage == 1
 
 
 def sweep(env, speed, steps=400):
@@ -141,16 +144,16 @@ def test_a_touch_is_a_contact_of_a_tenth_of_a_second_from_its_start():
     act, timestep = performer.make(env), env.reset()
     while not timestep.last() and timestep.observation["held"][0] < 0.5:
       timestep = env.step(act(timestep))
-    physics.peak_force, task.tolerance = force, tolerance
+    physics.peak_tissue, task.tolerance = force, tolerance
     task.advance(physics)
     assert task.observe(physics)["held"] == 0
-    physics.peak_force, task.tolerance = 0.1, 0.005
+    physics.peak_tissue, task.tolerance = 0.1, 0.005
     for _ in range(10):
       task.advance(physics)
     assert task.observe(physics)["held"] == 0 and task.outcome is None
-    physics.peak_force = 0.0
+    physics.peak_tissue = 0.0
     task.advance(physics)
-    physics.peak_force = 0.1
+    physics.peak_tissue = 0.1
     for _ in range(5):
       task.advance(physics)
     assert task.outcome == "success"
@@ -163,11 +166,11 @@ def test_success_above_the_limit_is_worth_less_and_damage_takes_back_what_was_pa
   shares, paid = iter([0.3, 0.9]), []
   task.advance = lambda physics: next(shares)
   for force in (1.0, 3.0 * (1 - 1e-9)):  # below the limit of 1.5 N, then at twice that
-    physics.peak_force = force
+    physics.peak_tissue = force
     task.after_step(physics)
     paid.append(task.get_reward(physics))
   assert paid == pytest.approx([0.4 * 0.3, 0.4 * 0.6 - 0.1])
-  shares, physics.peak_force = iter([1.0]), 3.5
+  shares, physics.peak_tissue = iter([1.0]), 3.5
   task.after_step(physics)
   paid.append(task.get_reward(physics))
   assert task.outcome == "damage" and task.progress == -1
@@ -185,7 +188,7 @@ def test_no_failure_pays_as_much_as_any_success(name):
     shares, paid = iter([0.5] * 200 + [last]), 0.0
     task.advance = lambda physics, shares=shares: next(shares)
     for _ in range(200):  # all that costs may take
-      physics.peak_force = force
+      physics.peak_tissue = force
       task.after_step(physics)
       paid += task.get_reward(physics)
     task.outcome = "success" if last == 1.0 else None

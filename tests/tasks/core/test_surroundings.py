@@ -49,9 +49,13 @@ def test_who_goes_aside_meets_what_is_around(name, surroundings):
     if "surroundings" in events:
       break
   met = surroundings == "unseen"
-  assert (env.task.cost.shaft > 0) == met and (max(felt) > 0.1) == met
+  assert (env.task.cost.surroundings > 0) == met and (max(felt) > 0.1) == met
   assert env.task.outcome is None and ("surroundings" in events) == met
-  if met:  # further in the force grows as that of a spring, and the wall does not throw it back
+  if met:  # it is felt, and is no tissue
+    forces = env.physics.forces()
+    assert forces["force"].max() < 1e-9 < 0.1 < forces["surroundings_force"].max() == max(felt)
+    assert env.task.cost.shaft == 0 == env.physics.peak_tissue
+    # Further in the force grows as that of a spring, and the wall does not throw it back.
     more = [env.step(aside).observation["peak_force"][0] for _ in range(4)]
     assert felt[-1] < max(more) < 3
 
@@ -64,7 +68,8 @@ def test_nobody_begins_in_what_is_around(name):
     env.reset()
     mujoco.mj_forward(env.physics.model.ptr, env.physics.data.ptr)
     for hand in env.physics.hands:
-      assert not hand.sensor(instrument.AROUND).any()
+      for name in instrument.AROUND:
+        assert not hand.sensor(name).any()
 
 
 def _scenery(model) -> dict[str, np.ndarray]:

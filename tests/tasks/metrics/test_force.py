@@ -128,7 +128,7 @@ def test_shaft_contact():
   time = np.arange(6) * 0.5
   force = [0, 0.2, 0.3, 0, 0, 0.4]
   assert metrics.shaft_contact(time, force) == pytest.approx(0.5 + 0.5 + 0.25)
-  assert metrics.peak_shaft_force(force) == 0.4
+  assert metrics.peak_shaft_force(force) == 0.4 == metrics.peak_surroundings_force(force)
   assert metrics.shaft_contact(time, force, contact_force=0.25) == pytest.approx(0.75)
   # That there was none is known, unlike what a force would have been without contact.
   assert metrics.shaft_contact(time, np.zeros(6)) == 0 == metrics.peak_shaft_force(np.zeros(6))
