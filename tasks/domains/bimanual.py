@@ -7,12 +7,12 @@ Own observations: those of `dissect`, and `hook_front` (3,), from the hook to th
 holds [m]; `retracted` (1,), how far the site is from its place at rest, away from the bed, as a
 share of what is needed [-]; `burnt` (1,), share of the burn that is damage [-].
 
-A current frees the bonds within 3 mm of the hook's wire in 0.2 s. What comes free while the site is
-grasped and retracted by 5 mm, with the pull on the liver under its limit and the hook's force under
-1.5 N, is `clean`; the rest is `torn`: what is not held away is not seen. A current without a bond
-in reach burns what the hook touches; half a second of that is damage, and so is a hook that presses
-with 3 N. Progress, success and failure are those of `dissect`; the bed is too strong to be pulled
-off.
+A current frees the bonds within 3 mm of the axis of the hook's wire in 0.2 s: at most 1.3 mm from
+the wire to the organ's surface. What comes free while the site is grasped and retracted by 5 mm,
+with the pull on the liver under its limit and the hook's force under 1.5 N, is `clean`; the rest is
+`torn`: what is not held away is not seen. A current without a bond in reach burns what the hook
+touches; half a second of that is damage, and so is a hook that presses with 3 N. Progress, success
+and failure are those of `dissect`; the bed is too strong to be pulled off.
 """
 
 import dataclasses

@@ -98,12 +98,15 @@ def standing(done: Sequence[Episode]) -> tuple[str, str]:
 
 
 def _next(episodes: Sequence[Episode]) -> str:
-  """Returns what to do next, in words."""
+  """Returns what to do next, in words, and what was interrupted."""
   from palpate.tasks.people import curriculum
+  from palpate.tasks.recording import INTERRUPTED
 
   met = curriculum.done(history.passed(episodes))
   then = curriculum.following(met)
-  return f"exercises done: {len(met)}, " + (f"next is {then}" if then else "nothing is left")
+  cut_off = sum(e.outcome == INTERRUPTED for e in episodes)
+  said = f"exercises done: {len(met)}, " + (f"next is {then}" if then else "nothing is left")
+  return f"{said}; {cut_off} interrupted, not counted" if cut_off else said
 
 
 def _picture(

@@ -212,7 +212,8 @@ def test_a_killed_exercise_is_in_the_record_up_to_the_last_second(serve, tmp_pat
   assert episode.differences(made, episode.replay(made)) == ["constant state_last"]
   assert report.ending(made).startswith("Interrupted: the program was killed")
   assert cli.main(["trainee", "show", "Ada", "--record", str(folder)]) == 0
-  assert "attempts" not in capsys.readouterr().out  # it is none
+  said = capsys.readouterr().out
+  assert "; 1 interrupted, not counted" in said and "attempts" not in said
 
 
 def test_a_closed_tab_keeps_its_recording(serve, tmp_path):

@@ -1,10 +1,13 @@
 """An expert is proficient on fresh seeds, a skilled person within reach of it, a novice is not."""
 
+import functools
+
 import numpy as np
 import pytest
 from palpate import tasks
 from palpate.tasks import suite
 from palpate.tasks.core import episode, performer
+from palpate.tasks.domains import tease
 from palpate.tasks.people import score
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
@@ -51,6 +54,32 @@ def test_the_expert_teases_with_the_tip_alone():
   metrics = recording.metrics()
   assert recording.outcome == score.SUCCESS
   assert metrics.shaft_contact <= 0.003 and metrics.peak_shaft_force < 0.05
+
+
+def sideways(task, p):
+  """Goes to and fro across the strip, along the front of what holds, at 20 mm/s."""
+  side, over, wide = 1.0, 0.002, 0.008
+  front = tease.front(p.physics)
+  for back in (0.03, 0.004):
+    yield from p.move(np.array([-wide, front[1] - back, over]), speed=0.03)
+  while task.outcome is None:
+    bonds = p.physics.organ.bonds
+    where = bonds.positions[~bonds.free]
+    lanes = [where[np.abs(where[:, 0] - x) < 0.003, 1] for x in (-0.006, 0.0, 0.006)]
+    y = np.median([lane.min() for lane in lanes if len(lane)])
+    yield from p.move(np.array([p.tip[0], y, over]), speed=0.015)
+    yield from p.move(np.array([side * wide, y, over]), speed=0.02)
+    side = -side
+
+
+def test_a_gentler_technique_than_the_experts_is_proficient():
+  """Sideways, with two thirds of the force and in half of the time."""
+  env = tasks.load("tease", "easy", task_kwargs={"random": 0})
+  env.task.expert = functools.partial(sideways, env.task)
+  recording = episode.run(env, performer.make(env), 0)
+  metrics = recording.metrics()
+  result = score.score(metrics, score.reference("tease/easy"), recording.outcome)
+  assert result.proficient and result.composite > 0 and metrics.peak_force < 0.5
 
 
 @pytest.mark.parametrize("name", NAMES)
