@@ -360,9 +360,9 @@ class Task(engine.Task):
     """Measures the progress and looks for errors and damage."""
     self.peak = max(self.peak, physics.peak_tissue)
     self.progress = self.advance(physics)
-    tip, before = physics.peak_tissue, self.cost
-    beside = {"shaft": physics.peak_shaft, "surroundings": physics.peak_surroundings}
-    self.cost = safety.cost(tip, *beside.values(), self.force_limit, self.damage)
+    tip, shaft, around = physics.peak_tissue, physics.peak_shaft, physics.peak_surroundings
+    beside, before = {"shaft": shaft, "surroundings": around}, self.cost
+    self.cost = safety.cost(tip, shaft, around, self.force_limit, self.damage)
     for where, force in beside.items():
       if getattr(self.cost, where) and not getattr(before, where):
         self.event(physics, "unintended_contact", force, label=where)
