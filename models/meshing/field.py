@@ -34,10 +34,7 @@ class Field:
 
   def surface(self, level: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Returns where the field has a level: vertices (n, 3), triangles (m, 3), winding outward."""
-    try:
-      from skimage.measure import marching_cubes
-    except ImportError as error:
-      raise ImportError("making an organ needs `pip install 'palpate[image]'`") from error
+    from skimage.measure import marching_cubes  # takes a second to import
 
     value = self.value - level
     value[value == 0] = 1e-9 * self.spacing  # on a grid point it would make slivers of no area

@@ -23,7 +23,6 @@ _EXTRAS = {
   "matplotlib": "plot",
   "imageio-ffmpeg": "video",
   "gymnasium": "gym",
-  "scikit-image": "image",
   "websockets": "live",
 }
 _TIMEOUT = 60  # [s]

@@ -90,14 +90,12 @@ def test_speed_step_and_configuration_act(tmp_path, capsys):
 
 
 def test_the_organ_is_made_anew_with_the_nodes_and_seed_asked_for(tmp_path, capsys):
-  pytest.importorskip("skimage")
   code, _ = run(tmp_path, "--nodes", "300", "--seed", "3")
   assert code == 0
   assert table(capsys.readouterr().out)["nodes"] == "300"
 
 
 def test_the_shipped_organ_is_what_the_code_makes():
-  pytest.importorskip("skimage")
   shipped = trimesh.load_mesh(command.folder() / "assets" / "organ.obj", process=False)
   vertices, triangles = command.organ_mesh()
   made = trimesh.Trimesh(vertices, triangles, process=False)

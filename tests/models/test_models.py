@@ -2,7 +2,6 @@
 
 import pathlib
 import re
-import sys
 
 import mujoco
 import numpy as np
@@ -263,12 +262,6 @@ def test_liver_rests_under_gravity():
     mujoco.mj_step(model, data)
   assert np.abs(organ.displacement - before).max() < 1e-4
   assert 1e-4 < np.abs(before).max() < 5e-3
-
-
-def test_a_missing_extra_is_named(monkeypatch):
-  monkeypatch.setitem(sys.modules, "skimage.measure", None)
-  with pytest.raises(ImportError, match=r"palpate\[image\]"):
-    models.load("kidney", seed=11)
 
 
 def test_bad_input():

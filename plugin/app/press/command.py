@@ -21,7 +21,6 @@ from ..console import (
   Progress,
   compile_error,
   csv_rows,
-  need,
   output,
   output_folder,
   table,
@@ -82,8 +81,6 @@ def main(args: argparse.Namespace) -> int:
   out = output_folder("out", args.out)
   video = _file(args, "video", out / "press.mp4", film.FILMS)
   picture = _file(args, "picture", out / "press_deepest.png", film.PICTURES)
-  if args.nodes is not None or args.seed is not None:
-    need("image", "skimage")
   register()
   from . import figures, probe
 

@@ -16,6 +16,7 @@ from typing import Any, cast
 import mujoco
 import numpy as np
 from mujoco.introspect import ast_nodes, structs
+from packaging import requirements
 
 NAME = "palpate.organ"  # of the plugin
 _ERROR = int(mujoco.mjtLogLevel.mjLOG_ERROR)
@@ -155,7 +156,13 @@ def name_of(m: C.Structure, addresses: int | None, index: int) -> str:
 
 
 def check():
-  """Raises ImportError where the layouts disagree with the bindings' own arrays."""
+  """Raises ImportError for a MuJoCo out of range, or where the bindings' arrays are elsewhere."""
+  for text in importlib.metadata.requires("palpate") or ():
+    need = requirements.Requirement(text)
+    if need.name == "mujoco" and not need.specifier.contains(mujoco.__version__, prereleases=True):
+      raise ImportError(
+        f"mujoco is {mujoco.__version__}, expected {need.specifier}: pip install '{need}'"
+      )
   m = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
   )

@@ -40,3 +40,10 @@ def test_a_layout_that_disagrees_with_the_bindings_is_an_import_error(monkeypatc
 
 def test_the_layouts_of_this_version_agree():
   mjstruct.check()
+
+
+@pytest.mark.parametrize("version", ["3.16.0", "5.0.0"])
+def test_another_mujoco_is_refused_by_what_to_install(version, monkeypatch):
+  monkeypatch.setattr(mujoco, "__version__", version)
+  with pytest.raises(ImportError, match=rf"mujoco is {version}, expected .*: pip install 'mujoco"):
+    mjstruct.check()
