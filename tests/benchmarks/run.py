@@ -25,6 +25,7 @@ BENCHES = {
   "locality": "what leaving out solved nodes would save",
   "loop": "the whole loop, mj_step with a probe on a windowed organ",
   "loopholes": "what a search finds in the exercises that does not do the work",
+  "native": "settings of MuJoCo's native flex beside each other",
   "paths": "how near cuts of surfaces follow their path, and what they keep",
   "peer": "run time against error, beside MuJoCo's native flex, tolerance by tolerance",
   "policies": "success of the policies that ship",
