@@ -122,8 +122,8 @@ def finding(rows: list[Row]) -> list[str]:
   few = [r for r in held if r["setting"].endswith(("trilinear", "quadratic"))]
   lines = [
     f"No setting within 5 % takes less than {fast['times']:.2f} of the time of `{PEER}`, the peer "
-    f"on the other pages; Newton takes {min(newton):.1f} to {max(newton):.0f} times as long for the "
-    "same error."
+    f"on the other pages; Newton takes {min(newton):.1f} to {max(newton):.0f} times as long for "
+    "the same error."
   ]
   lines += [
     f"`{r['setting']}` takes {r['times']:.2f} of the time and pushes {r['peak']:.1f} times as hard."
