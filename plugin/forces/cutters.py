@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.tissue.cutting.facets import Path
 from palpate.tissue.cutting.topology import Report
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import doubles, ints, struct
@@ -270,8 +271,11 @@ class Cutters(Force):
     organ, finder = self.host.organ, opening.finder
 
     def cut(path: np.ndarray, depth: np.ndarray | None) -> tuple[Report, Mesh]:
-      where = organ, opening.mesh(world), opening.disp(world), finder, way
-      return opening.cut(world, trails.path_of(path, depth, given, *where)), opening.mesh(world)
+      along = Path(path, given, at_rest=True)
+      if depth is not None:
+        where = organ, opening.mesh(world), opening.disp(world), finder, way
+        along = trails.path_of(path, depth, given, *where)
+      return opening.cut(world, along), opening.mesh(world)
 
     report, why = trails.open_path(row, organ, opening.mesh(world), ended, finder, cut)
     if "pinned" in why and self.host.alone and not self._said:

@@ -228,23 +228,21 @@ def _until(path: np.ndarray, depth: np.ndarray, left: np.ndarray):
 
 
 def path_of(
-  path: np.ndarray, depth: np.ndarray | None, given: float, organ: Declaration, mesh: Mesh,
+  path: np.ndarray, depth: np.ndarray, given: float, organ: Declaration, mesh: Mesh,
   disp: np.ndarray, finder: Finder, way: np.ndarray | None,
 ) -> Path:  # fmt: skip
-  """Returns the path that is cut behind a blade.
+  """Returns the path that is cut in a solid behind a blade.
 
   Args:
     path: at rest [m]                                 (n, 3)
-    depth: of a solid [m]                             (n,)
-    given: energy that what cuts has brought, of a solid by depth [J], [J/m]
+    depth: [m]                                        (n,)
+    given: energy by depth that what cuts has brought [J/m]
     organ: the organ before the first cut
     mesh: its mesh now
     disp: displacements of its vertices [m]           (nvert, 3)
     finder: of its surfaces
     way: along a blade in the world, of either sign; None for what cuts along the normal
   """
-  if depth is None:
-    return Path(path, given, at_rest=True)
   elem, weight, _ = finder.nearest(mesh, mesh.rest, path)
   corner = (mesh.rest + disp)[mesh.elem[elem]]
   now = np.einsum("nk,nkj->nj", weight, corner)
