@@ -1,5 +1,6 @@
 """The tutorials: their code runs as it stands, and ends with what their text promises."""
 
+import csv
 import json
 import pathlib
 import re
@@ -102,3 +103,15 @@ def test_every_notebook_is_listed_and_tested():
   page = (FOLDER / "README.md").read_text(encoding="utf-8")
   assert {path.stem for path in FOLDER.glob("*.ipynb")} == set(NAMES)
   assert set(re.findall(r"\]\((\w+)\.ipynb\)", page)) == set(NAMES)
+
+
+@pytest.mark.slow
+def test_ppo_learns_from_nothing_in_a_few_worlds_on_the_cpu(tmp_path):
+  pytest.importorskip("torch")
+  curve = tmp_path / "ppo.csv"
+  options = ["--device", "warp-cpu", "--worlds", "4", "--steps", "8", "--minutes", "0.1"]
+  command = [sys.executable, str(FOLDER / "ppo.py"), "touch/easy", *options, "--out", str(curve)]
+  subprocess.run(command, check=True, timeout=600)
+  rows = list(csv.DictReader(curve.open()))
+  assert len(rows) >= 2 and int(rows[-1]["steps"]) == 32 * len(rows)
+  assert all(float(row["spread"]) > 0 for row in rows)

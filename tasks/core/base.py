@@ -26,7 +26,8 @@ of Ng, Harada and Russell 1999. It takes a tenth of the step's cost (`task.cost`
 force over the limit, shaft against the organ, damage), until the costs of the episode have taken
 0.55. The rewards of a success add up to 0.45 to 1, those of any other episode to less than 0.4.
 `sparse` pays 1 on the step of success and 0 elsewhere.
-The domains' formulas of progress use closeness = max(1 - distance / distance at the start, -1).
+The domains' formulas of progress use `rules.closeness`: 1 at the goal, 0 at the distance that the
+exercise began with, towards -1 far away.
 
 An episode ends with `task.outcome`: `success`, `damage` (a force above the damage limit, of tip or
 shaft; the discount is 0 as for success), `missed` (a wrong report), or None when the time limit

@@ -10,12 +10,14 @@ and 4 mm of the shaft's axis: a fold beside the mark is another one.
 It stays grasped as long as all that is so and the site has not moved in the jaws by more than half
 of the lift, from where it was grasped, and again from where it was when the holding was done.
 
-Progress: 0.2 * closeness until it is grasped; then 0.3 + 0.4 * min(height / lift, 1) + 0.2 * held;
-0.9 + 0.05 * (1 - min(height / lift, 1)) once held long enough, 1 on release. Only time under the
-force limit counts as held. Lowered means to rest for 0.2 s, grasped, between a quarter of the lift
-below the site's place and 0.4 of the lift above it. Success: held, lowered, and let go with the
-site between there and half of the lift. Slipping from the jaws and letting go before it is lowered
-start the holding again. Failure: a force above the damage limit, jaws included, or the time limit.
+Progress: 0.2 * near until it is grasped, near being the closeness of the tip to within 5 mm of the
+site, which the jaws are to go over; then 0.3 + 0.4 * min(height / lift, 1) + 0.2 * held; 0.9 + 0.05
+* (1 - min(height / lift, 1)) + 0.03 * share of the rest once held long enough, 1 on release. Only
+time under the force limit counts as held. Lowered means to rest for 0.2 s, grasped, between a
+quarter of the lift below the site's place and 0.4 of the lift above it. Success: held, lowered, and
+let go with the site between there and half of the lift. Slipping from the jaws and letting go
+before it is lowered start the holding again. Failure: a force above the damage limit, jaws
+included, or the time limit.
 """
 
 import dataclasses
@@ -57,6 +59,7 @@ FUNDUS = Scene(
   camera=(-0.09, 0.072, 0.054),
 )
 REACH, ASIDE = 0.012, 0.004  # of the jaws around the site, and across the shaft [m]
+OVER = 0.005  # how far the tip may go past a site before it is paid less: jaws go over a fold [m]
 REST = 0.2  # at a low height before release [s]
 # Heights that it rests between, and is let go below, as shares of the lift.
 LOW, RESTING, LETTING = -0.25, 0.4, 0.5
@@ -110,6 +113,11 @@ def aside(s, o):
   """Returns how far the site is from the axis of the shaft [m]."""
   off = from_tip(s, point(s, o.site))
   return root(off[0] * off[0] + off[1] * off[1])
+
+
+def near(s, o):
+  """Returns the closeness of the jaws to where they can hold the site [-]."""
+  return closeness(max(distance(s, o) - OVER, 0.0), o.distance0 - OVER)
 
 
 def slid(s, o):
@@ -238,9 +246,9 @@ def advance(s, o):
   if o.grasped == 1.0:
     o = count(s, o, share)
   high = max(min(share, 1.0), 0.0)
-  progress = 0.2 * closeness(distance(s, o), o.distance0)
+  progress = 0.2 * near(s, o)
   if o.done:
-    progress = 0.9 + 0.05 * (1.0 - high)
+    progress = 0.9 + 0.05 * (1.0 - high) + 0.03 * min(o.lowered / REST, 1.0)
   elif o.grasped == 1.0:
     progress = 0.3 + 0.4 * high + 0.2 * min(o.time / o.hold, 1.0)
   return o, progress, RUNNING

@@ -3,8 +3,10 @@
 Pressing (`easy`, `standard`, `hard`, `depth`). Own observations: `target` (3,), from the tip to the
 site [m]; `normal` (3,), of the surface there [-]; `level` (1,), the pressed force [N] (or
 depth [m]) minus the middle of the band; `held` (1,), share of the holding time done [-].
-Progress: (sites done + 0.4 * closeness + 0.5 * held) / sites, closeness counting from the site
-before. Pressing counts within the tolerance of the site; leaving the band starts the holding again.
+Progress: (sites done + 0.4 * closeness + 0.05 * firm + 0.5 * held) / sites, closeness counting
+from the site before; firm is what is pressed within the tolerance over the band's lower end, at
+most 1, less what is above its upper end. Pressing counts within the tolerance of the site; leaving
+the band starts the holding again.
 
 Palpation (`palpate_easy`, `palpate_standard`, `palpate_hard`): a stiff inclusion lies somewhere
 under the field, some 27 cm^2 of the kidney's front. It can be felt, not seen: nothing that is
@@ -35,6 +37,7 @@ from ..core.rules import (
   SUCCESS,
   Rules,
   Vector,
+  clamp,
   closeness,
   dot,
   force,
@@ -155,6 +158,11 @@ def level(s, o):
   return force(s)
 
 
+def towards(o, much):
+  """Returns how near what is pressed is to the band: 1 in it, 0 without, less above it [-]."""
+  return clamp(much / o.low, 0.0, 1.0) - clamp((much - o.high) / o.high, 0.0, 1.0)
+
+
 def advance(s, o):
   """Counts the time in the band."""
   far, pressed = distance(s, o), force(s)
@@ -172,8 +180,9 @@ def advance(s, o):
     o.distance0 = far
   outcome = SUCCESS if o.done == o.goals.shape[0] else RUNNING
   near = closeness(far, o.distance0)
-  progress = (float(o.done) + 0.4 * near + 0.5 * o.time / o.hold) / float(o.goals.shape[0])
-  return o, progress, outcome
+  firm = towards(o, much) if far <= o.tolerance else 0.0
+  progress = float(o.done) + 0.4 * near + 0.05 * firm + 0.5 * o.time / o.hold
+  return o, progress / float(o.goals.shape[0]), outcome
 
 
 def observe(s, o):

@@ -5,10 +5,12 @@ tip to the hidden disc [m]; `visible` (1,), share of the disc that the laparosco
 `held` (1,), share of the holding time done [-]; `grasped` (1,), whether the jaws hold the site, as
 in `grasp`; here it may slip by 5 mm.
 
-Progress: 0.15 * closeness until it is grasped; then 0.3 + 0.5 * visible / wanted + 0.2 * held. Only
-the organ hides: instruments are not looked at. Success: the wanted share is seen for the holding
-time, the site being grasped and the force under its limit; what is above it does not count.
-Failure: a force above the damage limit, jaws included, or the time limit.
+Progress: 0.15 * near until it is grasped, near as in `grasp`; then 0.3 + 0.1 * aside + 0.4 *
+visible / wanted + 0.2 * held, aside being how far the site has come aside as a share of four radii
+of the disc, at most 1: it tells the way before the first of the disc is seen. Only the organ hides:
+instruments are not looked at. Success: the wanted share is seen for the holding time, the site
+being grasped and the force under its limit; what is above it does not count. Failure: a force above
+the damage limit, jaws included, or the time limit.
 """
 
 import dataclasses
@@ -26,7 +28,8 @@ from ..core.rules import (
   SUCCESS,
   Rules,
   Vector,
-  closeness,
+  clamp,
+  dot,
   drop,
   peak,
   point,
@@ -35,7 +38,7 @@ from ..core.rules import (
 )
 from ..core.scenes import Scene
 from ..registry import exercise
-from .grasp import FUNDUS, Held, Hold, distance, follow
+from .grasp import FUNDUS, Held, Hold, follow, near
 from .touch import SLACK
 
 _BEHIND = 0.02  # from the organ's middle to the disc [m]
@@ -71,6 +74,9 @@ class State(Held):
 
   wanted: float  # share of the disc
   hold: float  # [s]
+  radius: float  # of the disc [m]
+  rest: Vector  # the site's place at rest [m]
+  right: Vector  # where to pull it aside to
   disc: Annotated[Any, Array(wp.vec3, (SAMPLES,))]  # points of it [m]
   time: float  # held [s]
   hidden: Vector
@@ -79,6 +85,11 @@ class State(Held):
 
 
 # The rules.
+
+
+def pulled(s, o):
+  """Returns how far the site has come aside, as a share of four radii of the disc [-]."""
+  return clamp(dot(point(s, o.site) - o.rest, o.right) / (4.0 * o.radius), -1.0, 1.0)
 
 
 def advance(s, o):
@@ -93,9 +104,10 @@ def advance(s, o):
     o.time = o.time + o.control_timestep
   if o.time >= o.hold - SLACK:
     return o, 1.0, SUCCESS
-  progress = 0.15 * closeness(distance(s, o), o.distance0)
+  progress = 0.15 * near(s, o)
   if o.grasped == 1.0:
-    progress = 0.3 + 0.5 * min(o.visible / o.wanted, 1.0) + 0.2 * o.time / o.hold
+    seen = min(o.visible / o.wanted, 1.0)
+    progress = 0.3 + 0.1 * pulled(s, o) + 0.4 * seen + 0.2 * o.time / o.hold
   return o, progress, RUNNING
 
 
@@ -141,6 +153,7 @@ class Retract(Hold):
     """Draws the site to grasp and hides the disc behind the organ's edge, far from the trocar."""
     super().begin(physics)
     self.time, self.visible = 0.0, 0.0
+    self.rest = physics.point(self.site)
     _, center = self.place_of_work(physics)
     self.disc = self._hide(physics, center)
     physics.mark(0, self.disc[0], now=True, size=self.radius)

@@ -3,13 +3,12 @@
 Own observations: `target` (3,), from the tip to the next point of the curve [m]; `ahead` (3, 3),
 from the tip to points 5, 10 and 15 mm further along the curve [m].
 
-Progress: 0.1 * closeness to the curve's start until it is touched, then 0.1 + 0.9 * share of the
-curve's length traced. Tracing starts within the tolerance of the curve's start, and goes on as far
-as the tip gets along the curve while it presses with 0.02 N or more within the tolerance of it,
-step after step. Where contact is lost or the curve left, it goes on from what is traced already:
-what is skipped in the air does not count, but for gaps of 3 mm at most, together a tenth of the
-length. Success: all of it, to the last 1.5 mm. Failure: a force above the damage limit, or the time
-limit.
+Progress: 0.1 * closeness to the next point of the curve + 0.9 * share of the curve's length traced.
+Tracing starts within the tolerance of the curve's start, and goes on as far as the tip gets along
+the curve while it presses with 0.02 N or more within the tolerance of it, step after step. Where
+contact is lost or the curve left, it goes on from what is traced already: what is skipped in the
+air does not count, but for gaps of 3 mm at most, together a tenth of the length. Success: all of
+it, to the last 1.5 mm. Failure: a force above the damage limit, or the time limit.
 """
 
 import dataclasses
@@ -235,10 +234,7 @@ def advance(s, o):
   o.touching = touches
   if traced >= whole - STEP:
     return o, 1.0, SUCCESS
-  progress = 0.1 + 0.9 * traced / whole
-  if traced == 0.0:
-    progress = 0.1 * closeness(distance(s, o), o.distance0)
-  return o, progress, RUNNING
+  return o, 0.1 * closeness(distance(s, o), o.distance0) + 0.9 * traced / whole, RUNNING
 
 
 def observe(s, o):
