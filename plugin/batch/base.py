@@ -5,16 +5,21 @@ from __future__ import annotations
 import abc
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
 import warp as wp
 from palpate.engine import coupling
 from palpate.engine.model.declare import Declaration
+from palpate.engine.workspace import Workspace
 from palpate.organ import instances
+from palpate.tissue.geometry.mesh import Mesh
 
 from .cutting.fracture import Parting
+
+if TYPE_CHECKING:
+  from .camera import Camera
 
 _MOVING = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "plugin_state")
 
@@ -170,6 +175,42 @@ class Batch(abc.ABC):
       have = ", ".join(map(repr, self.organs)) or "none"
       raise ValueError(f"no organ {name!r} in the batch, it has {have}")
     return self.organs[name]
+
+  # Pictures.
+
+  def camera(
+    self,
+    name: str,
+    height: int,
+    width: int,
+    outputs: Sequence[str] = ("pixels",),
+    worlds: Sequence[int] | None = None,
+  ) -> Camera:
+    """Returns a camera that draws worlds on the device, see docs/pixels.md.
+
+    Args:
+      name: of a camera of the scene
+      height: of a picture [pixels], at most 1024
+      width: the same
+      outputs: some of `pixels` (red, green, blue, uint8), `depth` [m], `segmentation` (number and
+        `mjtObj` of what is seen, -1 for nothing), `points` [m] (in the camera's frame, x right, y
+        down, z forward; 0 where nothing is)
+      worlds: which ones; None for all
+
+    Raises:
+      ValueError: the model has no such camera, an argument is not allowed, the scene has something
+        that such a camera cannot draw, or the device no room for so many pictures.
+    """
+    raise ValueError("worlds on several devices have no cameras; their `parts` do")
+
+  def poses(self) -> tuple[wp.array, wp.array, np.ndarray]:
+    """Returns where bodies are now.
+
+    Returns:
+      positions (nworld, n) of vec3 [m] and axes (nworld, n) of mat33, which keep their place, and
+      which of the n a body of the model is  (nbody,)
+    """
+    raise ValueError("worlds on several devices have their bodies in `parts`")
 
   # Doing.
 
@@ -367,11 +408,13 @@ class Tissue(Parting):
     name: name of the flexcomp
     nvert: number of vertices
     elem: triangles, counter-clockwise from outside, (nelem, 3)
+    space: its workspace in one mjData
   """
 
   name: str
   nvert: int
   elem: np.ndarray
+  space: Workspace
 
   @abc.abstractmethod
   def _read(self, name: str) -> wp.array:
@@ -411,6 +454,10 @@ class Tissue(Parting):
   @abc.abstractmethod
   def bonds(self) -> Any:
     """What it has grown on to, see `palpate.batch.bonds.Bonds`."""
+
+  def meshes(self) -> Sequence[Mesh]:
+    """Returns the mesh of each world; it is another object once it was cut."""
+    raise ValueError("worlds on several devices have their meshes in `parts`")
 
   @abc.abstractmethod
   def configure(self, mask=None, **keys):
@@ -482,10 +529,15 @@ def free_memory() -> float:
     return float("inf")
 
 
-def refuse_crowd(nworld: int, each: float, room: float, where: str):
+def room_of(device) -> float:
+  """Returns how many bytes of a device a batch may take."""
+  return 0.95 * (device.free_memory if device.is_cuda else free_memory())
+
+
+def refuse_crowd(nworld: int, each: float, room: float, where: str, what: str = "nworld is"):
   """Raises ValueError where worlds of so many bytes do not fit; says how many do."""
   if nworld * each > room:
     raise ValueError(
-      f"nworld is {nworld}, which takes about {nworld * each / 1e9:.1f} GB, but {where} has "
+      f"{what} {nworld}, which takes about {nworld * each / 1e9:.1f} GB, but {where} has "
       f"{room / 1e9:.1f} GB free; expected at most {int(room / each)}"
     )

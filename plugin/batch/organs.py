@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,7 @@ from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
 from palpate.tissue.cutting.topology import Report, pieces
+from palpate.tissue.geometry.mesh import Mesh
 
 from . import bonds, host, kernels, patch
 from .base import Contacts, Tissue, spread
@@ -321,6 +323,13 @@ class Organ(Tissue):
   def feel(self, adr: int):
     """Adds the force of its cutters to a sensor of three numbers."""
     blades.feel(self.cuts_by, adr, self.batch.d.sensordata)
+
+  def meshes(self) -> Sequence[Mesh]:
+    """Returns the mesh of each world, see `Tissue`."""
+    if self._cuts is None:
+      return [self.declared.mesh] * self.batch.nworld
+    self._cuts.follow()
+    return [self._cuts.mesh(world) for world in range(self.batch.nworld)]
 
   def elem_of(self, world: int) -> np.ndarray:
     """Returns the triangles of a world, see `Tissue.elem_of`."""

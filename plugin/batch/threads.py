@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -20,9 +20,11 @@ from palpate.organ import Organ, instances
 from palpate.tissue import body as bodies
 from palpate.tissue.cutting.topology import Report
 from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry.mesh import Mesh
 
 from .base import Batch, Tissue, free_memory, refuse_crowd, spread
 from .bonds import OfThreads
+from .camera import Camera
 from .cutting.fracture import Cutters
 
 _OF_VERTICES = ("xpos", "xvel", "contact_force")
@@ -155,6 +157,28 @@ class Threads(Batch):
       for g, values in friction.items():
         model.geom_friction[g, 0] = values[k]
 
+  @functools.cached_property
+  def _poses(self) -> tuple[wp.array, wp.array]:
+    shape = self.nworld, self.model.nbody
+    pos, mat = (wp.zeros(shape, dtype=kind, device="cpu") for kind in (wp.vec3, wp.mat33))
+    return pos, mat
+
+  def camera(self, *args: Any, **kwargs: Any) -> Camera:
+    """Returns a camera, see `Batch`."""
+    return Camera(self, *args, **kwargs)
+
+  def poses(self) -> tuple[wp.array, wp.array, np.ndarray]:
+    """Returns where bodies are now, see `Batch`."""
+    pos, mat = (each.numpy() for each in self._poses)
+
+    def work(world: int):
+      data = self.datas[world]
+      mujoco.mj_kinematics(self.models[world], data)
+      pos[world], mat[world] = data.xpos, data.xmat.reshape(-1, 3, 3)
+
+    self.each(work)
+    return *self._poses, np.arange(self.model.nbody)
+
   def _tell(self):
     for name in ("qpos", "qvel", "sensordata"):
       out = self._arrays[name].numpy()
@@ -181,7 +205,7 @@ class _Tissue(Tissue):
     pairs = zip(batch.models, batch.datas, strict=True)
     self.handles = [Organ(model, data, name) for model, data in pairs]
     self.spaces = [engine.find(data._address, instance) for data in batch.datas]
-    self.name, self.elem = name, self.handles[0].elem
+    self.name, self.elem, self.space = name, self.handles[0].elem, self.spaces[0]
     self.nvert = coupling.outer(self.spaces[0].organ)
     self.batch, self._counted = batch, list[Any]([None] * batch.nworld)
     self._pieces = wp.zeros(batch.nworld, dtype=int, device="cpu")
@@ -247,6 +271,12 @@ class _Tissue(Tissue):
       for name in Cutters._fields
     )
     return Cutters(*(wp.array(column, dtype=float, device="cpu") for column in columns))
+
+  def meshes(self) -> Sequence[Mesh]:
+    """Returns the mesh of each world, see `Tissue`."""
+    for space in self.spaces:
+      cutting.follow(space)
+    return [space.organ.mesh for space in self.spaces]
 
   def elem_of(self, world: int) -> np.ndarray:
     """Returns the triangles of a world, see `Tissue.elem_of`."""

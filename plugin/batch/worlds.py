@@ -21,7 +21,8 @@ from palpate.organ import instances
 from palpate.tissue import device as devices
 
 from . import host, kernels, states, strip_organs
-from .base import Batch, free_memory, refuse_crowd
+from .base import Batch, refuse_crowd, room_of
+from .camera import Camera
 from .contact import contacts, convex
 from .organs import Organ
 from .private import DeterminismType, OverflowType
@@ -120,7 +121,7 @@ class Worlds(Batch):
       Organ.bytes_of(w, self.device) for w in spaces.values()
     )
     size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
-    refuse_crowd(nworld, size, _room(self.device), str(self.device))
+    refuse_crowd(nworld, size, room_of(self.device), str(self.device))
     try:
       own = ("dof_armature", "body_invweight0", "body_pos", "body_quat", "geom_friction")
       sizes: dict[str, int] = {name: nworld for name in own}
@@ -328,6 +329,16 @@ class Worlds(Batch):
     """Numbers of qpos and qvel in the model that are not an organ's."""
     return self._kept
 
+  def camera(self, *args: Any, **kwargs: Any) -> Camera:
+    """Returns a camera, see `Batch`."""
+    return Camera(self, *args, **kwargs)
+
+  def poses(self) -> tuple[wp.array, wp.array, np.ndarray]:
+    """Returns where bodies are now, see `Batch`."""
+    with wp.ScopedDevice(self.device):
+      mjw.kinematics(self.m, self.d)
+    return self.d.xpos, self.d.xmat, self.numbers
+
   def xmat(self, body: str) -> wp.array:
     """Returns the axes of a body in the last step, (nworld,) of mat33."""
     found: Any = self.d.xmat
@@ -358,7 +369,3 @@ def _resolve(device: str):
   if device == "warp-cpu":  # to test without a GPU
     return wp.get_device("cpu")
   return devices.resolve(device, 0)
-
-
-def _room(device) -> float:
-  return 0.95 * (device.free_memory if device.is_cuda else free_memory())

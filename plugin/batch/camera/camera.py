@@ -1,0 +1,355 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""A camera of a batch: pictures of all worlds, or of some."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.engine.model import flexes
+from palpate.tissue.types import fill
+
+from ..base import refuse_crowd, room_of
+from . import kernels
+from .scene import Scene, colour, labelled
+from .soft import Surface
+
+if TYPE_CHECKING:
+  from palpate.engine.model.declare import Declaration
+
+  from ..base import Batch
+
+_OBJ, _LIGHT = mujoco.mjtObj, mujoco.mjtLightType
+OUTPUTS = {  # dtype of Warp, and what follows height and width
+  "pixels": (wp.uint8, (3,)),
+  "depth": (wp.float32, ()),
+  "segmentation": (wp.vec2i, ()),
+  "labels": (wp.uint8, ()),
+  "points": (wp.vec3, ()),
+}
+_OF_ROWS = ("lamp_pos", "lamp_dir", "ambient", "diffuse", "specular")
+MOST = 1024  # height and width [pixels]
+# Bytes that a row has for a vertex and a triangle of organs, the tree of boxes among them.
+_VERTEX, _TRIANGLE = 36.0, 200.0
+_STILL = "sah"  # how the tree of a surface is made that keeps its shape
+_BLOCK = 64  # threads of a block: rays that end sooner do not wait for many others
+_LEAF = 1  # triangles of a leaf
+_TILE = 32  # pixels that are drawn side by side
+_FINE = 128  # height of a picture from which skins are as fine as they are declared [pixels]
+
+
+class Camera:
+  """A camera in worlds of a batch; `Batch.camera` makes it.
+
+  Attributes:
+    pictures: arrays of the last `draw` by name, a row a world; they keep their place
+    worlds: numbers of the worlds
+    view: what the kernels read, a row a world, see `kernels.View`
+  """
+
+  def __init__(
+    self,
+    batch: Batch,
+    name: str,
+    height: int,
+    width: int,
+    outputs: Sequence[str] = ("pixels",),
+    worlds: Sequence[int] | None = None,
+    labels: Mapping[tuple[int, int], int] | None = None,
+  ):
+    model = batch.model
+    self._batch, self.worlds = batch, [*range(batch.nworld)] if worlds is None else [*worlds]
+    camera = _camera(model, name)
+    size = _size(height, width)
+    unknown = [each for each in outputs if each not in OUTPUTS]
+    if unknown or not outputs:
+      raise ValueError(f"outputs is {outputs!r}, expected some of {', '.join(OUTPUTS)}")
+    for world in self.worlds:
+      batch.index(world)
+    self._device, self._number, self._bodies = batch.device, camera, batch.poses()[2]
+    organs = {
+      (int(_OBJ.mjOBJ_FLEX), f) for tissue in batch.organs.values()
+      for f in _flexes(tissue.space.organ, model)
+    } | {
+      (int(_OBJ.mjOBJ_SKIN), tissue.space.skin.index)
+      for tissue in batch.organs.values() if tissue.space.skin is not None
+    }  # fmt: skip
+    self.scene = Scene(model, organs)
+    detail = 4 if size[0] > _FINE else 1
+    self._surfaces = [
+      Surface(tissue, model, self.scene, detail) for tissue in batch.organs.values()
+    ]
+    self._surfaces = [each for each in self._surfaces if each.nvert]
+    self._refuse_crowd(size, outputs)
+    self._colours = [each.colour for each in self.scene.things]
+    values = self._allocate(size, outputs)
+    values |= self._things(labels) | self._parts() | self._organs(values)
+    values |= self._view(model, camera)
+    self.view: Any = fill(kernels.View, self._device, values)
+    self.pictures = {name: values[name] for name in outputs}
+
+  # Making.
+
+  def _refuse_crowd(self, size: tuple[int, int], outputs: Sequence[str]):
+    """Raises ValueError where there is no room for so many pictures."""
+    pixel = sum(
+      wp.types.type_size_in_bytes(dtype) * int(np.prod(more))
+      for dtype, more in (OUTPUTS[name] for name in outputs)
+    )
+    each = size[0] * size[1] * pixel + 128.0 * (len(self.scene.things) + len(self.scene.parts))
+    each += sum(_VERTEX * s.nvert + _TRIANGLE * len(s.face) for s in self._surfaces)
+    refuse_crowd(
+      len(self.worlds), each, room_of(self._device), str(self._device), "worlds to draw are"
+    )
+
+  def _allocate(self, size: tuple[int, int], outputs: Sequence[str]) -> dict[str, Any]:
+    n = len(self.worlds)
+    values: dict[str, Any] = {"height": size[0], "width": size[1]}
+    values["world"] = wp.array(self.worlds, dtype=int, device=self._device)
+    values["chosen"] = wp.full(n, True, dtype=wp.bool, device=self._device)
+    for name, (dtype, more) in OUTPUTS.items():
+      shape = (n * (name in outputs), *size, *more)
+      values[name] = wp.zeros(shape, dtype=dtype, device=self._device)
+    return values
+
+  def _rows(self, values: Any) -> np.ndarray:
+    """Returns an array with a row for every world, all the same."""
+    values = np.asarray(values, np.float32)
+    return np.tile(values, (len(self.worlds), *[1] * values.ndim))
+
+  def look(self, m: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Returns what a row has of its own of cameras, lamps and colours where a model has changed.
+
+    Args:
+      m: the batch's model, or another of the same scene; its colours, lamps and camera may differ
+
+    Returns:
+      values of fields of `kernels.View`, without their first axis
+    """
+    mat, lamps = np.zeros(9), _lamps(m)
+    mujoco.mju_quat2Mat(mat, m.cam_quat[self._number])
+    return dict(
+      cam_pos=m.cam_pos[self._number], cam_mat=mat.reshape(3, 3),
+      fovy=np.radians(m.cam_fovy[self._number]),
+      rgba=np.array([colour(m, *key) for key in self._colours]),
+      **{name: np.array([lamp[name] for lamp in lamps]) for name in _OF_ROWS},
+    )  # fmt: skip
+
+  def show(self, rows: np.ndarray, values: Mapping[str, np.ndarray]):
+    """Gives rows camera, lamps and colours of their own.
+
+    Args:
+      rows: numbers of rows
+      values: as `look` returns them, a row for each of these
+    """
+    for name, value in values.items():
+      array = getattr(self.view, name)
+      whole = array.numpy()
+      whole[rows] = value
+      array.assign(whole)
+
+  def _things(self, labels: Mapping[tuple[int, int], int] | None) -> dict[str, Any]:
+    things, scene = self.scene.things, self.scene
+    return dict(
+      tex=self._rows([thing.tex for thing in things]).astype(np.int32),
+      gloss=np.array([thing.gloss for thing in things]),
+      kind=np.array([(thing.id, thing.kind) for thing in things], np.int32),
+      label=labelled(things, labels or {}), texel=scene.texels, image=scene.images, sky=scene.sky,
+    )  # fmt: skip
+
+  def _parts(self) -> dict[str, Any]:
+    parts, scene = [p for p in self.scene.parts if len(p.surface.face)], self.scene
+    self._meshes, ball, start = [], [], np.cumsum([0, *(len(p.surface.face) for p in parts)])
+    for part in parts:
+      vert = part.surface.vert
+      self._meshes.append(
+        wp.Mesh(
+          points=wp.array(vert, dtype=wp.vec3, device=self._device),
+          indices=wp.array(part.surface.face.ravel(), dtype=int, device=self._device),
+          bvh_constructor=_STILL,
+          bvh_leaf_size=_LEAF,
+        )
+      )
+      middle = 0.5 * (vert.min(axis=0) + vert.max(axis=0))
+      ball.append([*middle, np.linalg.norm(vert - middle, axis=1).max()])
+    self._sites = {part.site: k for k, part in enumerate(parts) if part.site >= 0}
+    n = len(parts), len(self.worlds)
+    soft = self._surfaces
+    one = [scene.density(p.surface, p.thing) for p in parts]
+    one += [scene.density(each.triangles, each.thing) for each in soft]
+    return dict(
+      thing=np.concatenate([p.thing for p in parts] + [each.thing for each in soft]),
+      dense=np.concatenate(one),
+      flat=np.concatenate([np.zeros(start[-1], int), *(each.flat for each in soft)]),
+      coord=np.concatenate([p.surface.coord for p in parts] + [each.coord for each in soft]),
+      corner_normal=np.concatenate([p.surface.normal for p in parts]),
+      mesh=np.array([mesh.id for mesh in self._meshes], np.uint64), start=start[:-1],
+      soft_start=int(start[-1]), part_body=self._bodies[[p.body for p in parts]].astype(np.int32),
+      part_thing=np.array([p.thing[0] if p.clear else -1 for p in parts], np.int32),
+      part_mat=np.array([p.mat for p in parts]), ball=np.array(ball),
+      part_pos=self._rows([p.pos for p in parts]), part_size=self._rows([p.size for p in parts]),
+      bound=np.zeros((n[1], n[0], 4)), place=np.zeros((n[1], n[0], 3)),
+      axes=np.zeros((n[1], n[0], 3, 3)),
+    )  # fmt: skip
+
+  def _organs(self, values: dict[str, Any]) -> dict[str, Any]:
+    """Makes the mesh of all organs in all rows, a group of triangles a row."""
+    n, device = len(self.worlds), self._device
+    nvert, nface = (
+      np.cumsum([0, *sizes])
+      for sizes in ([s.nvert for s in self._surfaces], [len(s.face) for s in self._surfaces])
+    )
+    stride, count = int(nvert[-1]), int(nface[-1])
+    self._soft, self._tree = list[Any](), None
+    if not count:
+      return dict(
+        soft=0, root=np.zeros(0, np.int32), stride=0, soft_corner=np.zeros((n, 0, 3), np.int32),
+        point=np.zeros((0, 3)), normal=np.zeros((0, 3)), lips=np.zeros((n, 0), np.uint8),
+        lip_thing=np.zeros(0, np.int32),
+      )  # fmt: skip
+    face = np.concatenate([s.face + k for s, k in zip(self._surfaces, nvert, strict=False)])
+    corner = (face[None] + stride * np.arange(n)[:, None, None]).astype(np.int32)
+    base = np.concatenate([s.base for s in self._surfaces])
+    with wp.ScopedDevice(device):
+      point = wp.array(np.tile(base, (n, 1)), dtype=wp.vec3)
+      normal = wp.zeros(len(point), dtype=wp.vec3)
+      index = wp.array(corner.reshape(-1), dtype=int)
+      shared = {"point": point, "normal": normal, "corner": index.reshape((n, count, 3))}
+      self._soft = [
+        s.make(values["world"], int(a), int(b), shared)
+        for s, a, b in zip(self._surfaces, nvert, nface, strict=False)
+      ]
+      group = wp.array(np.repeat(np.arange(n), count), dtype=int)
+      how = "lbvh" if device.is_cuda else "sah"
+      self._tree = wp.Mesh(
+        points=point, indices=index, groups=group, bvh_constructor=how, bvh_leaf_size=_LEAF
+      )
+      root = wp.zeros(n, dtype=int)
+      wp.launch(kernels.find_roots, dim=n, inputs=[self._tree.id, root])
+    return dict(
+      soft=self._tree.id, root=root, stride=stride, soft_corner=shared["corner"], point=point,
+      normal=normal, lips=np.zeros((n, count), np.uint8),
+      lip_thing=np.concatenate([s.lip for s in self._surfaces]),
+    )  # fmt: skip
+
+  def _view(self, m: mujoco.MjModel, camera: int) -> dict[str, Any]:
+    extent, lamps = float(m.stat.extent), _lamps(m)
+    xpos, xmat, _ = self._batch.poses()
+    body = [-1 if lamp["body"] < 0 else self._bodies[lamp["body"]] for lamp in lamps]
+    zero = np.zeros((len(lamps), 3))
+    return dict(
+      near=float(m.vis.map.znear) * extent, far=float(m.vis.map.zfar) * extent, xpos=xpos,
+      xmat=xmat, cam_body=int(self._bodies[m.cam_bodyid[camera]]), bend=self._rows(np.zeros(2)),
+      eye=self._rows(np.zeros(3)), look=self._rows(np.eye(3)),
+      film=self._rows([0.0, 1.0, 0.0]), count=np.zeros(1, np.int32),
+      lamp_kind=np.array([lamp["kind"] for lamp in lamps], np.int32),
+      lamp_body=np.array(body, np.int32), fade=np.array([lamp["fade"] for lamp in lamps]),
+      spot=np.array([lamp["spot"] for lamp in lamps]), lamp_at=self._rows(zero),
+      lamp_to=self._rows(zero),
+      **{name: self._rows(value) for name, value in self.look(m).items()},
+    )  # fmt: skip
+
+  def part(self, site: int) -> int:
+    """Returns the number of the part that a site is."""
+    return self._sites[site]
+
+  def thing(self, kind: int, number: int) -> int:
+    """Returns the number of the thing that is an `mjtObj` of a number."""
+    return [(each.kind, each.id) for each in self.scene.things].index((kind, number))
+
+  def skin(self, organ: str) -> tuple[np.ndarray, np.ndarray]:
+    """Returns an organ's surface at rest as it is drawn: vertices [m] and triangles."""
+    (found,) = (each for each in self._surfaces if each.tissue.name == organ)
+    return found.base.copy(), found.face
+
+  # Drawing.
+
+  def draw(self) -> dict[str, wp.array]:
+    """Draws all worlds as they are now; returns `pictures`."""
+    self.follow()
+    self.launch()
+    return self.pictures
+
+  def follow(self):
+    """Follows cuts since the last picture."""
+    for surface in self._surfaces:
+      surface.follow(self.worlds, self.view.lips)
+
+  def choose(self, mask: wp.array | None):
+    """Lets the next pictures be of the worlds of a mask on the device alone, None for all."""
+    if mask is None:
+      self.view.chosen.fill_(True)
+    else:
+      wp.copy(self.view.chosen, mask)
+
+  def launch(self):
+    """Launches what draws; it can be recorded in a graph."""
+    c, n, device = self.view, len(self.worlds), self._device
+    self._batch.poses()
+    with wp.ScopedDevice(device):
+      for surface, soft in zip(self._surfaces, self._soft, strict=True):
+        soft.x = surface.tissue.xpos
+        wp.launch(kernels.follow, dim=(n, surface.nvert), inputs=[soft])
+        wp.launch(kernels.lift, dim=(n, surface.nvert), inputs=[soft])
+      if self._tree is not None:
+        self._tree.refit()
+      wp.launch(kernels.aim, dim=n, inputs=[c])
+      wp.launch(kernels.put, dim=(n, c.mesh.shape[0]), inputs=[c])
+      tiles = -(-c.width // 8) * -(-c.height // 4)
+      wp.launch(kernels.draw, dim=(n, tiles, _TILE), inputs=[c], block_dim=_BLOCK)
+
+
+def _lamps(m: mujoco.MjModel) -> list[dict[str, Any]]:
+  """Returns the lamps that MuJoCo's renderer knows, that at the lens first, by field of `View`."""
+  zero, out = np.zeros(3), []
+
+  def add(kind: int, body: int, pos, way, colours, fade=zero, spot=(-1.0, 0.0)):
+    places = {"lamp_pos": pos, "lamp_dir": way} | dict(zip(_OF_ROWS[2:], colours, strict=True))
+    own = {name: np.array(value, float) for name, value in places.items()}
+    out.append(own | {"kind": kind, "body": body, "fade": np.array(fade, float), "spot": spot})
+
+  head, way = m.vis.headlight, int(_LIGHT.mjLIGHT_DIRECTIONAL)
+  if head.active:
+    add(way, -1, zero, zero, (head.ambient, head.diffuse, head.specular))
+  for k in np.flatnonzero(m.light_active):
+    if m.light_type[k] in (way, int(_LIGHT.mjLIGHT_SPOT)):
+      cutoff = np.cos(np.radians(m.light_cutoff[k])) if m.light_cutoff[k] <= 90 else -1.0
+      colours = m.light_ambient[k], m.light_diffuse[k], m.light_specular[k]
+      add(
+        int(m.light_type[k]), int(m.light_bodyid[k]), m.light_pos[k], m.light_dir[k], colours,
+        m.light_attenuation[k], (cutoff, m.light_exponent[k]),
+      )  # fmt: skip
+  if not out:
+    add(way, -1, zero, zero, (np.full(3, 0.3), zero, zero))
+  return out
+
+
+def _camera(model: mujoco.MjModel, name: str) -> int:
+  names = [mujoco.mj_id2name(model, _OBJ.mjOBJ_CAMERA, k) for k in range(model.ncam)]
+  if name not in names:
+    have = ", ".join(map(repr, names)) or "none"
+    raise ValueError(f"no camera {name!r} in the model, it has {have}")
+  camera = names.index(name)
+  if model.cam_mode[camera] != mujoco.mjtCamLight.mjCAMLIGHT_FIXED:
+    raise ValueError(f"camera {name!r} follows something, expected mode fixed")
+  return camera
+
+
+def _flexes(organ: Declaration, model: mujoco.MjModel) -> list[int]:
+  """Returns the flexes that an organ has, those that draw its cuts too."""
+  walls = organ.config.walls
+  names = [mujoco.mj_id2name(model, _OBJ.mjOBJ_FLEX, f) or "" for f in range(model.nflex)]
+  found = walls and flexes.resolve(walls, organ.name, names)
+  return [organ.flex, *map(int, organ.flexes), *([names.index(found)] if found else [])]
+
+
+def _size(height: Any, width: Any) -> tuple[int, int]:
+  for what, value in (("height", height), ("width", width)):
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or not 1 <= value <= MOST:
+      raise ValueError(f"{what} is {value!r}, expected a whole number in [1, {MOST}] [pixels]")
+  return int(height), int(width)
