@@ -147,6 +147,12 @@ def cutter(s: Common):
 
 
 @word
+def ended(s: Common, o: Any):
+  """See `rules`."""
+  return s.outcome[s.world] != 0
+
+
+@word
 def pieces(s: Common):
   """See `rules`."""
   return s.piece_count[s.world]

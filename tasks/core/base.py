@@ -54,7 +54,7 @@ from .handle import ROW
 from .instrument import AXES, JAWS
 from .physics import Physics, check_scene
 from .randomisation import Ranges
-from .rules import DAMAGED, OUTCOMES, SUCCESS
+from .rules import DAMAGED, HIDDEN, NOW, OUTCOMES, SUCCESS
 from .scenes import ORGAN, Scene
 from .stage import STATE, Stage
 
@@ -241,6 +241,15 @@ class Task(engine.Task):
 
   def show(self, physics: Physics) -> None:
     """Moves the marks of the pictures after a control step."""
+    if not self.rules or not self.rules.mark:
+      return
+    for k in range(self.targets):
+      place, look = self.rules.mark(physics, self, k)
+      physics.mark(k, place, look != HIDDEN, look == NOW, self.mark_size(k))
+
+  def mark_size(self, k: int) -> float:
+    """Returns the radius of a mark [m]."""
+    return 0.003
 
   def label(self, kind: str) -> str:
     """Returns what an event of the rules is called, see `event`."""
@@ -307,6 +316,7 @@ class Task(engine.Task):
     physics.quiet()
     self._place_instrument(physics)
     self.begin(physics)
+    self.show(physics)
     self.nodes0 = physics.nodes()
     self.start = physics.tip_pos()
 

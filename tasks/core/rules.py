@@ -19,6 +19,7 @@ import warp as wp
 from palpate.tissue.types import Array
 
 RUNNING, SUCCESS, DAMAGED, MISSED = range(4)
+HIDDEN, LATER, NOW = range(3)  # looks of a mark
 FAR = 1e9  # farther than anything [m]
 OUTCOMES = (None, "success", "damage", "missed")
 
@@ -43,6 +44,8 @@ class Rules:
     metrics: of the domain's own, by the field that is an episode's value so far
     act: rule (s, o) that returns o once an action has moved the drives, before the physics, or None
     shared: arrays of the state that are the same in all worlds and episodes
+    mark: rule (s, o, k) that returns where the pictures' mark k is [m], and its look, one of
+      HIDDEN, LATER, NOW; None for no marks
   """
 
   state: type
@@ -52,13 +55,17 @@ class Rules:
   metrics: Mapping[str, str] = dataclasses.field(default_factory=dict)
   act: Callable | None = None
   shared: tuple[str, ...] = ()
+  mark: Callable | None = None
 
   def __post_init__(self):
     where = f"{self.state.__module__}.{self.state.__qualname__}"
-    for name in ("advance", "observe", *(["act"] if self.act else [])):
-      rule = getattr(self, name)
-      if not inspect.isfunction(rule) or len(inspect.signature(rule).parameters) != 2:
-        raise TypeError(f"{where}: {name} is {rule!r}, expected a function of s and o")
+    for name, rule in vars(self).items():
+      given = {"advance": "s and o", "observe": "s and o", "act": "s and o", "mark": "s, o and k"}
+      if name not in given or (rule is None and name in ("act", "mark")):
+        continue
+      count = 2 + (name == "mark")
+      if not inspect.isfunction(rule) or len(inspect.signature(rule).parameters) != count:
+        raise TypeError(f"{where}: {name} is {rule!r}, expected a function of {given[name]}")
     known = self.fields
     for name, kind in known.items():
       if kind not in KINDS and not isinstance(kind, Array):
@@ -242,6 +249,11 @@ def cutter(s: Any) -> tuple[bool, float, np.ndarray]:
   """Returns of what cuts whether it is inside, how far it came, where it is at rest [m, m]."""
   (found,) = s.organ.cutters
   return found.inside, found.length, found.seat
+
+
+def ended(s: Any, o: Any) -> bool:
+  """Returns whether the episode has an outcome."""
+  return bool(o.outcome)
 
 
 def pieces(s: Any) -> int:

@@ -22,6 +22,7 @@ from palpate.models.catalog import Tissue
 from palpate.tissue.geometry.mesh import vertex_normals
 
 NOW, LATER = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95)  # colours of targets
+FILM, RAW = (0.9, 0.74, 0.55, 0.9), (0.32, 0.05, 0.04, 1.0)  # colours of bonds that hold, and did
 ORGAN = "organ"
 BED = "bed"  # patch of the gallbladder, and the body that is in the liver's place
 CAMERA = "laparoscope"
@@ -158,6 +159,15 @@ def landmark(scene: Scene, name: str) -> np.ndarray:
   if name not in marks:
     raise ValueError(f"organ {scene.organ!r} has no landmark {name!r}, it has {', '.join(marks)}")
   return marks[name]
+
+
+def films(model: mujoco.MjModel, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns which bonds have a film, and the sites that draw it."""
+  names = [model.site(k).name for k in range(model.nsite)]
+  found = [(k, f"{BED}{vertex}") for k, vertex in enumerate(vertices)]
+  pairs = [(k, names.index(name)) for k, name in found if name in names]
+  which, sites = np.array(pairs, int).reshape(-1, 2).T
+  return which, sites
 
 
 def build(scene: Scene) -> mujoco.MjSpec:

@@ -205,6 +205,7 @@ class Bimanual(Dissect):
     (*Dissect.rules.observed, "hook_front", "retracted", "burnt"),
     METRICS | {"current_time": "powered", "current_wasted": "wasted"},
     act,
+    mark=Dissect.rules.mark,
   )
   slots = 36
 

@@ -28,6 +28,8 @@ from ..core.performer import Performer, Script
 from ..core.rules import (
   DAMAGED,
   FAR,
+  HIDDEN,
+  LATER,
   RUNNING,
   SUCCESS,
   Rules,
@@ -42,6 +44,7 @@ from ..core.rules import (
   root,
   rows,
   tip,
+  vector,
 )
 from ..core.scenes import Scene
 from ..registry import exercise
@@ -60,7 +63,7 @@ COVERED = 0.98  # share of the line that is to be cut
 CLOSING = 0.006  # length that is cut beyond that of the line where the piece counts as free [m]
 STEP = 0.001  # between points of the line [m]
 FIRST, SECOND, THIRD = 5, 10, 15  # points further on that are observed
-_MARKS, _ABOVE = 36, (0.0, 0.0, 0.0006)  # spheres that draw the line, and how far above it [m]
+MARKS, ABOVE = 36, 0.0006  # spheres that draw the line, and how far above it [m]
 LEAP = 10  # points of the line between two control steps that do not follow one another
 # Of the expert: how fast it cuts [m/s], and how deep the tip is under the sheet and over it [m].
 _SPEED, _DEEP, _OVER = 0.012, 0.0035, 0.012
@@ -235,6 +238,12 @@ def observe(s, o):
   return o
 
 
+def mark(s, o, k):
+  """Marks the line where it is not cut: there are the lips of the cut."""
+  at = k * o.count // MARKS
+  return o.curve[at] + vector(0.0, 0.0, ABOVE), HIDDEN if o.cut[at] > 0 else LATER
+
+
 class Cut(Task):
   """Cut out a marked piece."""
 
@@ -251,6 +260,7 @@ class Cut(Task):
       "cut_jagged": "jagged",
       "cut_depth": "deepest",
     },
+    mark=mark,
   )
 
   def __init__(
@@ -275,7 +285,7 @@ class Cut(Task):
       tolerance: largest distance of the cut from the line [m]
       **kwargs: see Task
     """
-    self.targets = _MARKS
+    self.targets = MARKS
     if not 0.005 <= radius * (1 + abs(wave)) <= 0.024:
       raise ValueError(
         f"{name}: radius is {radius} and wave {wave}, expected a line from 5 to 24 mm of the middle"
@@ -285,7 +295,7 @@ class Cut(Task):
     self.radius, self.wave, self.tolerance = radius, wave, tolerance
     self.room = len(line(radius, wave, 0.0)[0]) + 4  # another may have a point or two more
     kwargs = {"force_limit": 0.8, "damage": 2.0, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=_MARKS), random, name=name, **kwargs)
+    super().__init__(dataclasses.replace(scene, targets=MARKS), random, name=name, **kwargs)
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene, which has no other shapes."""
@@ -304,14 +314,10 @@ class Cut(Task):
     self.inside, self.travelled, self.seat = cutter(physics)
     self.done, self.next, self.covered, self.nearest = 0, 0, 0.0, 0.0
     self.distance0 = distance(physics, self)
-    self._marked = np.linspace(0, len(self.curve), _MARKS, endpoint=False).astype(int)
-    for i, k in enumerate(self._marked):
-      physics.mark(i, self.curve[k] + _ABOVE, size=0.0009)
 
-  def show(self, physics: Physics) -> None:
-    """Takes the line away where it is cut: there are the lips of the cut."""
-    cut = self.cut[self._marked] > 0
-    physics.model.site_rgba[np.array(physics.target_sites)[cut], 3] = 0.0
+  def mark_size(self, k: int) -> float:
+    """Returns the radius of a mark [m]."""
+    return 0.0009
 
   def label(self, kind: str) -> str:
     """Returns what damage is."""

@@ -23,6 +23,7 @@ import numpy as np
 from ..core.base import Physics
 from ..core.performer import Performer, Script
 from ..core.rules import (
+  NOW,
   Rules,
   Vector,
   bond,
@@ -122,11 +123,16 @@ def observe(s, o):
   return o
 
 
+def mark(s, o, k):
+  """Marks the site."""
+  return point(s, o.site), NOW
+
+
 class Dissect(Freeing, Hold):
   """Free an organ from its bed by traction."""
 
   rules = Rules(
-    State, advance, observe, ("target", "front", "freed", "traction", "grasped"), METRICS
+    State, advance, observe, ("target", "front", "freed", "traction", "grasped"), METRICS, mark=mark
   )
   slip = 0.006
 
@@ -150,12 +156,6 @@ class Dissect(Freeing, Hold):
     super().begin(physics)
     self.whole(physics)
     self.last = physics.tip_pos()
-    self.show(physics)
-
-  def show(self, physics: Physics) -> None:
-    """Marks the site, and shows the bed."""
-    super().show(physics)
-    physics.mark(0, physics.point(self.site), now=True)
 
   def instruct(self, physics: Physics) -> str:
     """Says to grasp, or to pull."""

@@ -16,9 +16,8 @@ from ..core.rules import (
   tear,
   traction,
 )
-from ..core.scenes import BED, Scene
+from ..core.scenes import FILM, RAW, Scene, films
 
-FILM, RAW = (0.9, 0.74, 0.55, 0.9), (0.32, 0.05, 0.04, 1.0)  # colours of bonds that hold, and did
 SEEN = 1e-5  # what rounding may take from a share, in float32 too
 
 
@@ -117,13 +116,11 @@ class Freeing(Task):
     """Begins with bonds that are whole."""
     self.clean, self.torn, self.traction, self.pulled = 0.0, 0.0, 0.0, 0.0
     self.freed = share_freed(physics)
-    model = physics.model.ptr
-    found = [model.site(k).name for k in range(model.nsite)]
-    names = [f"{BED}{vertex}" for vertex in physics.organ.bonds.vertices]
-    self._films = np.array([found.index(name) for name in names if name in found], int)
+    self._films = films(physics.model.ptr, physics.organ.bonds.vertices)[1]
 
   def show(self, physics: Physics) -> None:
     """Shows the film of bonds that hold, and the raw bed where they did."""
+    super().show(physics)
     if len(self._films):
       free = physics.organ.bonds.free[:, None]
       physics.model.site_rgba[self._films] = np.where(free, RAW, FILM)

@@ -28,6 +28,7 @@ import numpy as np
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
 from ..core.rules import (
+  LATER,
   RUNNING,
   SUCCESS,
   Rules,
@@ -262,10 +263,15 @@ def observe(s, o):
   return o
 
 
+def mark(s, o, k):
+  """Marks the site."""
+  return point(s, o.site), LATER
+
+
 class Grasp(Hold):
   """Grasp, lift, hold, lower, release."""
 
-  rules = Rules(State, advance, observe, ("target", "height", "held", "grasped"))
+  rules = Rules(State, advance, observe, ("target", "height", "held", "grasped"), mark=mark)
 
   def __init__(self, scene: Scene, random=None, *, lift: float, hold: float, **kwargs):
     """Makes the task.
@@ -288,11 +294,6 @@ class Grasp(Hold):
     self.rest = physics.point(self.site)
     self.up = physics.trocar().mat[:, 2]
     again(self)
-    self.show(physics)
-
-  def show(self, physics: Physics) -> None:
-    """Marks the site."""
-    physics.mark(0, physics.point(self.site))
 
   @property
   def rests(self) -> bool:

@@ -16,11 +16,14 @@ from ..core import scenes
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
 from ..core.rules import (
+  HIDDEN,
+  LATER,
   MISSED,
   RUNNING,
   SUCCESS,
   Rules,
   Vector,
+  ended,
   force,
   last_component,
   length,
@@ -112,11 +115,16 @@ def observe(s, o):
   return o
 
 
+def mark(s, o, k):
+  """Marks the inclusion, once it was reported."""
+  return o.inclusion, LATER if ended(s, o) else HIDDEN
+
+
 class Palpate(Task):
   """Find the stiff inclusion and report its place."""
 
   rules = Rules(
-    State, advance, observe, ("field", "felt", "left", "target", "normal"), shared=SHARED
+    State, advance, observe, ("field", "felt", "left", "target", "normal"), shared=SHARED, mark=mark
   )
   final = ("report",)
 
@@ -212,12 +220,6 @@ class Palpate(Task):
   def begin(self, physics: Physics) -> None:
     """Starts the search."""
     self.touched, self.felt = np.zeros(self.nplace, int), 0.0
-    physics.mark(0, self.center, shown=False)
-
-  def show(self, physics: Physics) -> None:
-    """Shows where the inclusion is, once it was reported."""
-    if self.outcome:
-      physics.mark(0, self.inclusion, shown=True)
 
   def label(self, kind: str) -> str:
     """Returns what was done there."""

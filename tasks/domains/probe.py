@@ -33,6 +33,9 @@ from palpate.tissue.types import Array, ints
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
 from ..core.rules import (
+  HIDDEN,
+  LATER,
+  NOW,
   RUNNING,
   SUCCESS,
   Rules,
@@ -194,10 +197,16 @@ def observe(s, o):
   return o
 
 
+def mark(s, o, k):
+  """Marks the sites that are left."""
+  look = LATER if k > o.done else HIDDEN
+  return o.points[k], NOW if k == o.done else look
+
+
 class Press(Task):
   """Press sites into a band of force or depth and hold."""
 
-  rules = Rules(State, advance, observe, ("target", "normal", "level", "held"))
+  rules = Rules(State, advance, observe, ("target", "normal", "level", "held"), mark=mark)
 
   def __init__(
     self,
@@ -240,15 +249,6 @@ class Press(Task):
     self._path = float(
       np.linalg.norm(np.diff([physics.tip_pos(), *self.points], axis=0), axis=1).sum()
     )
-    self._shown = -1
-    self.show(physics)
-
-  def show(self, physics: Physics) -> None:
-    """Marks the sites that are left."""
-    if self._shown != self.done:
-      self._shown = self.done
-      for i, point in enumerate(self.points):
-        physics.mark(i, point, shown=i >= self.done, now=i == self.done)
 
   def label(self, kind: str) -> str:
     """Returns the number of the site."""

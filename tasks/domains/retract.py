@@ -24,6 +24,8 @@ from palpate.tissue.types import Array
 from ..core.base import Physics
 from ..core.performer import Performer, Script
 from ..core.rules import (
+  LATER,
+  NOW,
   RUNNING,
   SUCCESS,
   Rules,
@@ -119,10 +121,19 @@ def observe(s, o):
   return o
 
 
+def mark(s, o, k):
+  """Marks what the organ hides, and the site."""
+  if k == 0:
+    return o.disc[0], NOW
+  return point(s, o.site), LATER
+
+
 class Retract(Hold):
   """Pull tissue aside and hold it."""
 
-  rules = Rules(State, advance, observe, ("target", "hidden", "visible", "held", "grasped"))
+  rules = Rules(
+    State, advance, observe, ("target", "hidden", "visible", "held", "grasped"), mark=mark
+  )
 
   def __init__(
     self,
@@ -156,12 +167,10 @@ class Retract(Hold):
     self.rest = physics.point(self.site)
     _, center = self.place_of_work(physics)
     self.disc = self._hide(physics, center)
-    physics.mark(0, self.disc[0], now=True, size=self.radius)
-    self.show(physics)
 
-  def show(self, physics: Physics) -> None:
-    """Marks the site."""
-    physics.mark(1, physics.point(self.site))
+  def mark_size(self, k: int) -> float:
+    """Returns the disc's radius of the first, see `Task`."""
+    return super().mark_size(k) if k else self.radius
 
   def _hide(self, physics: Physics, center: np.ndarray) -> np.ndarray:
     _, mat, _ = physics.camera()

@@ -20,6 +20,7 @@ from ..core.base import Physics
 from ..core.performer import Performer, Script
 from ..core.rules import (
   FAR,
+  NOW,
   Rules,
   Vector,
   bond,
@@ -124,11 +125,16 @@ def observe(s, o):
   return o
 
 
+def mark(s, o, k):
+  """Marks the front."""
+  return o.front, NOW
+
+
 class Tease(Freeing):
   """Free a strip by blunt strokes."""
 
   watch = ("unintended_contact",)
-  rules = Rules(State, advance, observe, ("target", "freed", "traction"), METRICS)
+  rules = Rules(State, advance, observe, ("target", "freed", "traction"), METRICS, mark=mark)
   slots = 24
 
   def __init__(
@@ -167,11 +173,6 @@ class Tease(Freeing):
     self.whole(physics)
     self.front, self.nearest = front(physics), 0.0
     self.distance0 = distance(physics, self)
-    self.show(physics)
-
-  def show(self, physics: Physics) -> None:
-    """Marks the front."""
-    physics.mark(0, self.front, now=True)
 
   def instruct(self, physics: Physics) -> str:
     """Says to stroke."""

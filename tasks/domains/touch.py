@@ -19,6 +19,9 @@ from palpate.tissue.types import ints
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
 from ..core.rules import (
+  HIDDEN,
+  LATER,
+  NOW,
   RUNNING,
   SUCCESS,
   Rules,
@@ -129,10 +132,16 @@ def observe(s, o):
   return o
 
 
+def mark(s, o, k):
+  """Marks the points that are left."""
+  look = LATER if k > o.done else HIDDEN
+  return point(s, o.goals[k]), NOW if k == o.done else look
+
+
 class Touch(Task):
   """Touch points in order."""
 
-  rules = Rules(State, advance, observe, ("target", "normal", "held"))
+  rules = Rules(State, advance, observe, ("target", "normal", "held"), mark=mark)
 
   def __init__(self, points: int, tolerance: float, scene: Scene, random=None, **kwargs):
     """Makes the task.
@@ -157,15 +166,6 @@ class Touch(Task):
     self.distance0 = distance(physics, self)
     stations = np.array([physics.tip_pos(), *(physics.point(t) for t in self.goals)])
     self._path = float(np.linalg.norm(np.diff(stations, axis=0), axis=1).sum())
-    self._shown = -1
-    self.show(physics)
-
-  def show(self, physics: Physics) -> None:
-    """Marks the points that are left, where they were when the last one was touched."""
-    if self._shown != self.done:
-      self._shown = self.done
-      for i, goal in enumerate(self.goals):
-        physics.mark(i, physics.point(goal), shown=i >= self.done, now=i == self.done)
 
   def label(self, kind: str) -> str:
     """Returns the number of the point."""

@@ -24,6 +24,7 @@ from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
 from ..core.rules import (
   FAR,
+  LATER,
   RUNNING,
   SUCCESS,
   Rules,
@@ -54,7 +55,7 @@ FIRST, SECOND, THIRD = AHEAD
 DRAWN = 160  # points along the curve as it is drawn
 _ATTEMPTS = 40
 _FACING = 0.7  # least cosine between the surface's normal and the way to the trocar
-_MARKS = 30  # spheres that draw the curve
+MARKS = 30  # spheres that draw the curve
 
 
 @exercise("trace/easy", 20, "easy")
@@ -249,11 +250,16 @@ def observe(s, o):
   return o
 
 
+def mark(s, o, k):
+  """Marks the curve."""
+  return place(s, o, (2 * k * (o.count - 1) + MARKS - 1) // (2 * (MARKS - 1))), LATER
+
+
 class Trace(Task):
   """Follow a curve in light contact."""
 
   watch = ("miss", "unintended_contact", "drop")
-  rules = Rules(State, advance, observe, ("target", "ahead"))
+  rules = Rules(State, advance, observe, ("target", "ahead"), mark=mark)
 
   def __init__(
     self,
@@ -275,10 +281,10 @@ class Trace(Task):
       tolerance: largest distance of the tip from the curve [m]
       **kwargs: see Task
     """
-    self.targets = _MARKS
+    self.targets = MARKS
     self.size, self.turns, self.tolerance = size, turns, tolerance
     kwargs = {"spread": 0.03, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=_MARKS), random, **kwargs)
+    super().__init__(dataclasses.replace(scene, targets=MARKS), random, **kwargs)
 
   def begin(self, physics: Physics) -> None:
     """Draws the curve: a wave in the plane across the shaft, dropped on the surface."""
@@ -298,8 +304,10 @@ class Trace(Task):
     self.tracing, self.touching = False, False
     self.now, self.count = self.curve, len(self.curve)
     self.distance0 = distance(physics, self)
-    for i, k in enumerate(np.linspace(0, len(self.curve) - 1, _MARKS).round().astype(int)):
-      physics.mark(i, self.curve[k], size=0.0015)
+
+  def mark_size(self, k: int) -> float:
+    """Returns the radius of a mark [m]."""
+    return 0.0015
 
   def _draw(self, physics: Physics, center: np.ndarray, size: float):
     """Returns points, triangles and weights in them; None where the curve leaves the place."""
