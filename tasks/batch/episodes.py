@@ -11,15 +11,17 @@ import gymnasium
 import mujoco as mj
 import numpy as np
 from palpate.models import trocar
+from palpate.tasks.core import randomisation
 from palpate.tasks.core.base import Task
 from palpate.tasks.core.engine import wrap
 from palpate.tasks.core.instrument import Second
 from palpate.tasks.core.physics import Physics
 from palpate.tasks.core.scenes import ORGAN
 
-# What every exercise draws: trocar and joints of an instrument, and the length of the path.
+# What every exercise draws: trocar and joints of an instrument, the length of the path, and where
+# the laparoscope is.
 HAND = ("body_pos", "body_quat", "pose")
-FRAME = (*HAND, "reference")
+FRAME = (*HAND, "reference", "eye")
 
 
 class Posed:
@@ -72,6 +74,7 @@ class Episodes:
   Attributes:
     physics: of the scene at rest
     rows: what the worlds began with by name, (nworld, ...) each
+    look: returns what of pictures differs where a model was changed, None without pictures
   """
 
   def __init__(self, task: Task, draw: Callable[[Task], Mapping[str, np.ndarray]], nworld: int):
@@ -84,6 +87,7 @@ class Episodes:
     self._next: dict[str, np.ndarray] = {}
     self._ready = np.zeros(nworld, bool)
     self._where: tuple[bytes, Any] = (b"", None)
+    self.look: Callable[[mj.MjModel], Mapping[str, np.ndarray]] | None = None
     self._place_of_work, task.place_of_work = task.place_of_work, self._remember
 
   def _remember(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
@@ -137,6 +141,12 @@ class Episodes:
         raise ValueError(f"{self._task.name}: the trocar hangs on a body, expected the world")
       own = body.pos.copy(), body.quat.copy(), hand.pose
       frame |= dict(zip(of_hand(hand is not self.physics), own, strict=True))
+    if self.look and self._task.ranges:
+      frame["look_film"] = np.array(randomisation.film(self._task.drawn))
+      frame |= {f"look_{k}": v for k, v in self.look(model).items()}
+      frame |= {f"drawn_{k}": np.array(v) for k, v in self._task.drawn.items()}
+    mj.mj_camlight(model, self.physics.data.ptr)
+    frame["eye"] = self.physics.camera()[0]
     frame["reference"] = np.array(self._task.reference_length() or 0.0)
     return frame | dict(self._draw_own(self._task)) | dict(self._task.tissue())
 

@@ -53,7 +53,7 @@ class Common:
   # Of jaws, and of points that the organ may hide.
   side: floats("nside")  # of a geom, see `Jaws`
   inner: floats("nworld", 2)  # force of the jaws' inner faces [N]
-  eye: wp.vec3  # of the laparoscope [m]
+  eye: floats("nworld", 3)  # of the laparoscope [m]
   disc: Array(wp.vec3, ("nworld", "nspot"))  # [m]
   behind: Array(wp.bool, ("nworld", "nspot"))  # whether the organ hides them
   # Of bonds.

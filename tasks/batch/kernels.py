@@ -353,11 +353,12 @@ def hide(s: Common):
   """Finds which points of the disc the organ hides: rays against triangles, as `Physics.hidden`."""
   w, k = wp.tid()
   covered = wp.bool(False)
-  ray = s.disc[w, k] - s.eye
+  eye = vector(s.eye, w)
+  ray = s.disc[w, k] - eye
   for i in range(s.elem.shape[0]):
     a = node(s, w, s.elem[i, 0])
     e1, e2 = node(s, w, s.elem[i, 1]) - a, node(s, w, s.elem[i, 2]) - a
-    out = s.eye - a
+    out = eye - a
     across = wp.cross(out, e1)
     size = wp.dot(ray, wp.cross(e2, e1))
     side = wp.sign(size)

@@ -23,6 +23,7 @@ import warp as wp
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from palpate.batch.base import on_device
+from palpate.tasks.core import observation, randomisation
 from palpate.tasks.gym import Exercise
 
 from . import tally
@@ -49,7 +50,7 @@ class Exercises(VectorEnv):
     max_episode_steps: of an episode
   """
 
-  metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
+  metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"]}  # noqa: RUF012
 
   def __init__(
     self,
@@ -59,6 +60,9 @@ class Exercises(VectorEnv):
     device: str | Sequence[str] | None = None,
     output: str = "numpy",
     nodes: int | None = None,
+    render_mode: str | None = None,
+    width: int = 640,
+    height: int = 480,
     **kwargs: Any,
   ):
     """Makes the environment.
@@ -72,19 +76,27 @@ class Exercises(VectorEnv):
       output: what observations, rewards and flags are: `numpy`, or arrays of the device of `torch`
         or `warp`; all are copies
       nodes: on a GPU, see `palpate.batch.make`; None for what the instrument touches
+      render_mode: None or `rgb_array`, see `render`
+      width: of the pictures of `render` [pixels]
+      height: of these [pixels]
       **kwargs: of `Exercise`, such as `reward="sparse"`
 
     Raises:
       ValueError: a value is not allowed, or a vectorised exercise cannot do it; it is named.
     """
+    if render_mode not in (None, *self.metadata["render_modes"]):
+      raise ValueError(f"render_mode is {render_mode!r}, expected None or rgb_array")
     if output not in OUTPUTS:
       raise ValueError(f"output is {output!r}, expected one of {', '.join(OUTPUTS)}")
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
       raise ValueError(f"num_envs is {num_envs!r}, expected a whole number >= 1")
     self.num_envs, self.output = int(num_envs), output
     _refuse(task, kwargs)
-    kwargs = {"surroundings": "unseen", **kwargs}  # it draws nothing
+    chosen = observation.choose(kwargs.get("observations"), kwargs.get("pixels"))
+    seen = render_mode or chosen.pictures
+    kwargs = {"surroundings": "abdomen" if seen else "unseen", **kwargs}
     single = Exercise(task, **kwargs)
+    self.render_mode, self._size = render_mode, (height, width)
     environment = single.environment
     self.task, limit = environment.task, environment.step_limit
     _refuse_task(self.task)
@@ -190,7 +202,27 @@ class Exercises(VectorEnv):
 
   def _observations(self) -> dict[str, Any]:
     self._wait()
-    return {name: self._tell(OBSERVED.get(name) or name) for name in self._observed}
+    space: Any = self.single_observation_space
+    return {n: self._tell(OBSERVED.get(n) or n, space[n].dtype) for n in self._observed}
+
+  def render(self, worlds: Sequence[int] = (0,)) -> tuple[np.ndarray, ...] | None:
+    """Returns the laparoscope's pictures of some worlds, (height, width, 3) each, with `rgb_array`.
+
+    Args:
+      worlds: numbers of the worlds, the first alone by default
+    """
+    if self.render_mode is None:
+      return None
+    found: dict[int, np.ndarray] = {}
+    for part, at in zip(self.parts, self.slices, strict=True):
+      own = [int(world) for world in worlds if at.start <= world < at.stop]
+      if own:
+        seen = part.show([world - at.start for world in own], self._size)
+        found |= dict(zip(own, seen, strict=True))
+    missing = [world for world in worlds if world not in found]
+    if missing:
+      raise ValueError(f"world is {missing[0]}, expected one in [0, {self.num_envs})")
+    return tuple(found[world] for world in worlds)
 
   def _final(self, over: np.ndarray) -> Any:
     seen = self._observations()
@@ -220,7 +252,13 @@ class Exercises(VectorEnv):
     for name in ("progress", "peak_force"):
       found[name] = found[name][:, 0]
     known = np.ones(self.num_envs, bool) if where is None else where
+    if self.task.ranges:
+      found["randomised"] = {n: self._rows(f"drawn_{n}") for n in self.task.ranges}
     return found | {f"_{name}": known for name in INFO}
+
+  def _rows(self, name: str) -> np.ndarray:
+    """Returns what was drawn for the episodes of all worlds."""
+    return np.concatenate([part.episodes.rows[name] for part in self.parts])
 
 
 def _cat(arrays: list[wp.array]) -> Any:
@@ -252,7 +290,11 @@ def _mask(options: Mapping[str, Any] | None, count: int) -> np.ndarray:
 
 def _refuse(task: str, kwargs: Mapping[str, Any]) -> None:
   """Raises ValueError for what a vectorised exercise cannot do, naming it."""
-  for name in ("render_mode", "record", "model", "randomise"):
+  for name in randomisation.check(kwargs.get("randomise") or {}):
+    if not randomisation.QUANTITIES[name].seen:
+      what = f"randomise has {name!r}, which a vectorised exercise cannot do"
+      raise NotVectorisedError(f"{task}: {what}; {_ELSE}")
+  for name in ("record", "model"):
     if kwargs.get(name):
       what = f"{name} is given, which a vectorised exercise cannot do"
       raise NotVectorisedError(f"{task}: {what}; {_ELSE}")
@@ -262,8 +304,3 @@ def _refuse_task(task: Any) -> None:
   if task.rules is None:
     kind = type(task).__name__
     raise NotVectorisedError(f"{task.name}: rules of {kind} is None, expected Rules; {_ELSE}")
-  if task.observed.pictures:
-    raise NotVectorisedError(
-      f"{task.name}: observations has {task.observed.pictures[0]!r}, but a vectorised exercise "
-      f"makes no pictures; {_ELSE}"
-    )

@@ -23,6 +23,7 @@ from palpate.tissue.types import allocate
 from . import kernels, tally
 from .episodes import FRAME, HAND, Episodes, at_rest, of_hand
 from .fields import OBSERVED, Common
+from .pictures import Pictures
 from .states import States
 
 
@@ -38,6 +39,7 @@ class Worlds:
     organ: the organ in it
     device: of the arrays
     task: draws the episodes
+    pictures: what laparoscopes see, None where that is not observed
   """
 
   def __init__(
@@ -87,6 +89,9 @@ class Worlds:
     self._hows = tally.hows(self.device)
     self._bad = wp.zeros(1, dtype=int, device=self.device)
     self._done, self._graphs = set[str](), dict[str, Any]()
+    self._shown: tuple[Any, Any] = (), None  # pictures of `show`, and of what
+    seen = task.observed.pictures
+    self.pictures = Pictures(self, seen, task.observed.size) if seen else None
 
   def _write_states(self, at: wp.array, rows: Any, worlds: np.ndarray) -> None:
     """Begins with the states that were drawn for some worlds."""
@@ -132,7 +137,7 @@ class Worlds:
     for name, value in constants.items():
       getattr(s, name).assign(np.asarray(value))
     if s.behind.shape[1]:
-      s.disc, s.eye = self.states.rows["disc"], wp.vec3(*physics.camera()[0])
+      s.disc = self.states.rows["disc"]
     batch = self.batch
     s.ctrl, s.failures = batch.ctrl, batch.failures
     s.sensor_mean, s.sensor_steps = batch.sensor_mean, self._steps
@@ -179,9 +184,21 @@ class Worlds:
 
   # Doing.
 
+  def show(self, worlds: Sequence[int], size: tuple[int, int]) -> np.ndarray:
+    """Returns pictures of some worlds  (number of worlds, height, width, 3)."""
+    key = (*worlds, *size)
+    if self._shown[0] != key:
+      self._shown = key, Pictures(self, ["pixels"], size, worlds)
+    rows = {name: value[worlds] for name, value in self.episodes.rows.items()}
+    self._shown[1].show(np.arange(len(worlds)), rows)
+    self._shown[1].draw()
+    return self._shown[1].arrays["pixels"].numpy()
+
   def array(self, name: str) -> wp.array:
     """Returns one of the arrays of `states`, `fields` or `tally`; what rules tell goes first."""
     rules = self.task.rules
+    if self.pictures and name in self.pictures.arrays:
+      return self.pictures.arrays[name]
     if name in (*rules.observed, *rules.metrics.values()):
       return self.states.array(name)
     if name in Common.vars:
@@ -224,7 +241,9 @@ class Worlds:
     if self.states.act:
       self._act()
     self.batch.step(self._substeps)
-    self._run(self._judge)
+    self.run(self._judge)
+    if self.pictures:
+      self.pictures.draw()
 
   def _act(self) -> None:
     """Does what of an action no drive does."""
@@ -315,7 +334,10 @@ class Worlds:
       self.batch.pose([prefix + axis for axis in AXES], pose, s.begun)
     if self._tissue:
       self.organ.configure(mask, **{key: rows[key] for key in self._tissue})
-    self._run(self._open)
+    self.run(self._open)
+    if self.pictures:
+      self.pictures.show(worlds, rows)
+      self.pictures.draw(s.begun)
 
   def _write(self, out: wp.array, at: wp.array, rows: np.ndarray) -> None:
     """Writes rows of some worlds to an array on the device."""
@@ -336,9 +358,9 @@ class Worlds:
       self.launch(tally.start, self.nworld, [self.other, self._tally])
     self._observe(True)
 
-  def _run(self, work: Callable[[], None]) -> None:
+  def run(self, work: Callable[[], None]) -> None:
     """Launches work; on CUDA it is recorded the second time, and replayed from then on."""
-    name = work.__name__
+    name = work.__qualname__
     if self.device.is_cuda and name in self._done and name not in self._graphs:
       with wp.ScopedCapture(self.device) as capture:
         work()

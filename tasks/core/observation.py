@@ -17,6 +17,7 @@ import mujoco as mj
 import numpy as np
 from dm_env import specs
 
+from . import randomisation
 from .engine import Camera
 from .instrument import JAWS
 from .physics import COARSE, NEAR, Physics
@@ -131,19 +132,29 @@ def _points(camera: Camera, physics: Physics) -> np.ndarray:
   return points
 
 
-def _segmentation(camera: Camera, physics: Physics) -> np.ndarray:
-  model, found = physics.model.ptr, camera.render(segmentation=True)
-  kind, name = found[..., 1], found[..., 0]
-  out = np.zeros(kind.shape, np.uint8)
-  flex, site, geom = (mj.mjtObj.mjOBJ_FLEX, mj.mjtObj.mjOBJ_SITE, mj.mjtObj.mjOBJ_GEOM)
-  organ = [mj.mj_name2id(model, flex, physics.organ_name + part) for part in ("", "_inside")]
-  out[(kind == flex) & np.isin(name, organ)] = LABELS["organ"]
-  out[(kind == mj.mjtObj.mjOBJ_SKIN) & (name == physics.organ.skin)] = LABELS["organ"]
-  out[(kind == site) & np.isin(name, physics.target_sites)] = LABELS["target"]
+def labels(physics: Physics) -> dict[tuple[int, int], int]:
+  """Returns the labels of what has one in `segmentation`, by its `mjtObj` and number."""
+  model, kinds = physics.model.ptr, mj.mjtObj
+  flex, skin, site, geom = (
+    int(kind) for kind in (kinds.mjOBJ_FLEX, kinds.mjOBJ_SKIN, kinds.mjOBJ_SITE, kinds.mjOBJ_GEOM)
+  )
+  organ = [(flex, mj.mj_name2id(model, flex, physics.organ_name + s)) for s in ("", "_inside")]
+  organ += [] if physics.organ.skin is None else [(skin, physics.organ.skin)]
   hands = tuple(hand.prefix for hand in physics.hands)
-  bodies = [model.body(i).name.startswith(hands) for i in range(model.nbody)]
-  own = np.flatnonzero(np.array(bodies)[model.geom_bodyid])
-  out[(kind == geom) & np.isin(name, own)] = LABELS["instrument"]
+  bodies = np.array([model.body(i).name.startswith(hands) for i in range(model.nbody)])
+  own = np.flatnonzero(bodies[model.geom_bodyid]).tolist()
+  return (
+    dict.fromkeys(organ, LABELS["organ"])
+    | dict.fromkeys(((site, k) for k in physics.target_sites), LABELS["target"])
+    | dict.fromkeys(((geom, k) for k in own), LABELS["instrument"])
+  )
+
+
+def _segmentation(camera: Camera, physics: Physics) -> np.ndarray:
+  found = camera.render(segmentation=True)
+  out = np.zeros(found.shape[:2], np.uint8)
+  for (kind, number), label in labels(physics).items():
+    out[(found[..., 1] == kind) & (found[..., 0] == number)] = label
   return out
 
 
@@ -278,6 +289,8 @@ def take(task: Any, physics: Physics) -> collections.OrderedDict:
     for name in names:
       out[name] = PICTURES[name].draw(camera, physics)
     camera.scene.free()
+    if "pixels" in out:
+      out["pixels"] = randomisation.develop(out["pixels"], task.drawn, physics.time())
   return out
 
 

@@ -20,6 +20,7 @@ from . import stage
 from .physics import Physics
 from .scenes import CAMERA, LIGHT
 
+SMOKE = 0.75  # its grey
 Ranges = Mapping[str, tuple[float, float]]
 
 
@@ -34,6 +35,7 @@ class Quantity:
     high: greatest value allowed
     count: how many numbers are drawn
     apply: takes physics, stage and the numbers, and changes the model
+    seen: whether pictures alone show it: vectorised exercises draw that
   """
 
   what: str
@@ -42,6 +44,7 @@ class Quantity:
   high: float
   count: int
   apply: Callable[[Physics, stage.Stage, np.ndarray], None]
+  seen: bool = True
 
 
 def _stiffness(physics: Physics, place: stage.Stage, factor: np.ndarray) -> None:
@@ -81,6 +84,14 @@ def _light_pos(physics: Physics, place: stage.Stage, shift: np.ndarray) -> None:
   place.model.light_pos[:] += shift
 
 
+def _fovy(physics: Physics, place: stage.Stage, change: np.ndarray) -> None:
+  place.model.cam_fovy[place.model.camera(CAMERA).id] += change[0]
+
+
+def _developed(physics: Physics, place: stage.Stage, value: np.ndarray) -> None:
+  """Leaves the scene: `develop` changes the pictures."""
+
+
 def _colour(physics: Physics, place: stage.Stage, change: np.ndarray) -> None:
   model = place.model
   flex, skin = mj.mj_name2id(model, mj.mjtObj.mjOBJ_FLEX, physics.organ_name), physics.organ.skin
@@ -95,10 +106,10 @@ def _colour(physics: Physics, place: stage.Stage, change: np.ndarray) -> None:
 QUANTITIES = {
   "stiffness": Quantity(
     "factor on the organ's Young's modulus and foundation; it is let sink under its weight anew",
-    "-", 0.1, 10.0, 1, _stiffness,
+    "-", 0.1, 10.0, 1, _stiffness, False,
   ),
   "friction": Quantity(
-    "factor on the sliding friction of organ and instrument", "-", 0.0, 10.0, 1, _friction
+    "factor on the sliding friction of organ and instrument", "-", 0.0, 10.0, 1, _friction, False
   ),
   "camera_pos": Quantity(
     "shift of the laparoscope along each axis of its body, the world's in the exercises' scenes",
@@ -107,12 +118,21 @@ QUANTITIES = {
   "camera_turn": Quantity(
     "turn of the laparoscope, a rotation vector in its axes", "deg", -30.0, 30.0, 3, _camera_turn
   ),
+  "camera_fovy": Quantity(
+    "change of the laparoscope's vertical field of view", "deg", -20.0, 20.0, 1, _fovy
+  ),
   "light": Quantity("factor on the brightness of all lights", "-", 0.0, 5.0, 1, _light),
   "light_pos": Quantity(
     "shift of the lights along each axis", "m", -0.2, 0.2, 3, _light_pos
   ),
   "colour": Quantity(
     "change of the organ's red, green and blue, which are in [0, 1]", "-", -1.0, 1.0, 3, _colour
+  ),
+  "veil": Quantity("share of light grey smoke in `pixels`", "-", 0.0, 1.0, 1, _developed),
+  "exposure": Quantity("factor on `pixels`, after the smoke", "-", 0.0, 5.0, 1, _developed),
+  "noise": Quantity(
+    "standard deviation of noise on `pixels`, of 1, another in each picture", "-", 0.0, 0.5, 1,
+    _developed,
   ),
 }  # fmt: skip
 
@@ -158,6 +178,29 @@ def apply(
     quantity.apply(physics, place, values)
     drawn[name] = values.tolist() if quantity.count > 1 else float(values[0])
   return drawn
+
+
+def film(drawn: Mapping[str, Any]) -> tuple[float, float, float]:
+  """Returns veil, exposure and noise of what was drawn."""
+  return drawn.get("veil", 0.0), drawn.get("exposure", 1.0), drawn.get("noise", 0.0)
+
+
+def develop(pixels: np.ndarray, drawn: Mapping[str, Any], time: float) -> np.ndarray:
+  """Returns a picture as lens and sensor make it, of what the scene sends there.
+
+  Args:
+    pixels: (height, width, 3) uint8
+    drawn: what `apply` returned
+    time: of the picture [s], which decides the noise
+  """
+  veil, exposure, noise = film(drawn)
+  if (veil, exposure, noise) == (0.0, 1.0, 0.0):
+    return pixels
+  out = exposure * ((1 - veil) * (pixels / 255) + veil * SMOKE)
+  if noise:
+    random = np.random.default_rng([int(noise * 2**40), round(1e4 * time)])
+    out += noise * random.standard_normal(out.shape)
+  return (255 * out.clip(0, 1) + 0.5).astype(np.uint8)
 
 
 def table() -> str:

@@ -21,6 +21,7 @@ _STILL, _SETTLE, _LOOK = 1e-7, 3.0, 0.1
 _CHANGED = (
   "body_pos",
   "body_quat",
+  "cam_fovy",
   "cam_pos",
   "cam_quat",
   "flex_friction",

@@ -282,8 +282,7 @@ def test_bad_input_is_named():
   with pytest.raises(ValueError, match=r"expected at most \d+"):
     make("touch/easy", 10**9)
   for options, what in (
-    ({"pixels": (8, 8)}, "makes no pictures"),
-    ({"randomise": {"friction": (1, 2)}}, "randomise is given"),
+    ({"randomise": {"friction": (1, 2)}}, "randomise has 'friction'"),
     ({"record": True}, "record is given"),
   ):
     with pytest.raises(ValueError, match=f"{what}.*vectorization_mode"):
@@ -326,3 +325,47 @@ def test_arrays_of_warp():
   after = env.step(np.full((2, 4), 0.2))
   np.testing.assert_allclose(before, expected["tip_pos"], atol=1e-7)
   assert np.array_equal(seen["tip_pos"].numpy(), before) and after[1].shape == (2,)
+
+
+def test_pictures_are_those_of_the_single_environment():
+  task, names = "dissect/easy", ("pixels", "depth", "segmentation", "points")  # has marks and films
+  seen = dict(observations=["tip_pos", *names], pixels=(48, 64))
+  envs = make(task, 2, render_mode="rgb_array", width=32, height=24, **seen)
+  env = single(task, **seen)
+  found, expected = envs.reset(seed=3)[0], env.reset(seed=3)[0]
+  for _ in range(3):
+    action = np.random.RandomState(0).uniform(-1, 1, env.action_space.shape)
+    found, expected = envs.step(np.tile(action, (2, 1)))[0], env.step(action)[0]
+  for name in names:
+    assert found[name].shape[1:] == expected[name].shape
+    assert found[name].dtype == expected[name].dtype
+  both = {name: (found[name][0], expected[name]) for name in names}
+  assert (both["segmentation"][0] == both["segmentation"][1]).mean() > 0.99
+  assert set(np.unique(found["segmentation"][0])) >= {0, 1, 3}  # organ and target are seen
+  for name in ("depth", "points"):
+    near = np.abs(np.subtract(*both[name])) < 1e-3
+    assert near.mean() > 0.98
+  assert np.abs(both["pixels"][0].astype(float) - both["pixels"][1]).mean() < 8
+  (shown,) = envs.unwrapped.render([1])
+  assert shown.shape == (24, 32, 3) and np.ptp(shown) > 20
+  with pytest.raises(ValueError, match="world is 2, expected one in"):
+    envs.unwrapped.render([2])
+
+
+def test_what_pictures_show_is_drawn_for_every_world_as_in_the_single_environment():
+  ranges = {
+    "camera_pos": (-0.02, 0.02), "camera_turn": (-5, 5), "camera_fovy": (-5, 5),
+    "light": (0.5, 1.5), "light_pos": (-0.02, 0.02), "colour": (-0.3, 0.3),
+    "veil": (0.0, 0.4), "exposure": (0.7, 1.3),
+  }  # fmt: skip
+  seen = dict(observations=["pixels", "segmentation"], pixels=(48, 64), randomise=ranges)
+  envs = make("touch/easy", 2, **seen)
+  pictures, infos = envs.reset(seed=5)
+  for world in range(2):
+    env = single("touch/easy", **seen)
+    expected, info = env.reset(seed=5 + world)
+    for name, value in info["randomised"].items():
+      np.testing.assert_array_equal(infos["randomised"][name][world], value)
+    assert (pictures["segmentation"][world] == expected["segmentation"]).mean() > 0.98
+    assert np.abs(pictures["pixels"][world].astype(float) - expected["pixels"]).mean() < 8
+  assert np.abs(pictures["pixels"][0].astype(float) - pictures["pixels"][1]).mean() > 8

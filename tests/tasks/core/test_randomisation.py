@@ -18,6 +18,10 @@ RANGES = {
   "camera_turn": (-5, 5),
   "light": (0.5, 1.5),
   "light_pos": (-0.02, 0.02),
+  "camera_fovy": (-5, 5),
+  "veil": (0.1, 0.3),
+  "exposure": (0.8, 1.2),
+  "noise": (0.01, 0.05),
 }
 
 
@@ -98,6 +102,14 @@ def test_pictures_change():
 
   assert (colour(seen({"light": (0.5, 0.5)})) < 0.8 * colour(plain)).all()
   assert (colour(seen({"colour": (0.3, 0.3)})) > colour(plain) + 10).all()
+  assert (colour(seen({"exposure": (0.5, 0.5)})) < 0.52 * colour(plain)).all()
+  smoke = (0.5, 0.5), 255 * randomisation.SMOKE
+  half = 0.5 * (colour(plain) + smoke[1])
+  np.testing.assert_allclose(colour(seen({"veil": smoke[0]})), half, atol=1)
+  noise = seen({"noise": (0.1, 0.1)})["pixels"].astype(float) - plain["pixels"]
+  assert 0.07 < noise[organ].std() / 255 < 0.11
+  wide = seen({"camera_fovy": (20, 20)})["segmentation"] == observation.LABELS["organ"]
+  assert wide.mean() < 0.8 * organ.mean()
   turned = seen({"camera_turn": (5, 5)})["segmentation"] == observation.LABELS["organ"]
   moved = seen({"camera_pos": (0.02, 0.02)})["segmentation"] == observation.LABELS["organ"]
   assert turned.shape == (height, width)
