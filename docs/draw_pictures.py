@@ -1,4 +1,4 @@
-"""Draws the gallery's pictures anew, each by the command that stands beside it on the page.
+"""Draws the pages' pictures anew, each by the command that stands beside it.
 
 python docs/draw_pictures.py            # all
 python docs/draw_pictures.py grasp cut  # those with one of these words in their path
@@ -10,12 +10,15 @@ import shlex
 import subprocess
 import sys
 
-PAGE = pathlib.Path(__file__).with_name("gallery.md")
-PICTURE = re.compile(r"!\[[^]]*\]\(([^)]+)\)\s*\|?\s*`palpate (render [^`]+)`")
+FOLDER = pathlib.Path(__file__).parent
+COMMAND = r"`(?:palpate (render [^`]+)|python (docs/[^`]+))`"
+PICTURE = re.compile(r"!\[[^]]*\]\(([^)]+)\)\s*\|?\s*" + COMMAND)
 
-for path, command in PICTURE.findall(PAGE.read_text(encoding="utf-8")):
-  if len(sys.argv) > 1 and not any(word in path for word in sys.argv[1:]):
-    continue
-  words = shlex.split(command)
-  words[words.index("-o") + 1] = str((PAGE.parent / path).resolve())
-  subprocess.run([sys.executable, "-m", "palpate", *words], check=True, cwd=PAGE.parents[1])
+for page in ("gallery.md", "pixels.md"):
+  for path, command, script in PICTURE.findall((FOLDER / page).read_text(encoding="utf-8")):
+    if len(sys.argv) > 1 and not any(word in path for word in sys.argv[1:]):
+      continue
+    words = ["-m", "palpate", *shlex.split(command)] if command else [script]
+    if command:
+      words[words.index("-o") + 1] = str((FOLDER / path).resolve())
+    subprocess.run([sys.executable, *words], check=True, cwd=FOLDER.parent)

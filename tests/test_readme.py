@@ -80,6 +80,7 @@ GUIDES = {
   "docs/environments.md": "",
   "docs/fitting.md": "matplotlib",
   "docs/live.md": "",
+  "docs/pixels.md": "gymnasium",
   "docs/record.md": "matplotlib",
   "docs/trouble.md": "",
   "docs/vector.md": "gymnasium",
