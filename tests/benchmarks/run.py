@@ -28,6 +28,7 @@ BENCHES = {
   "native": "settings of MuJoCo's native flex beside each other",
   "paths": "how near cuts of surfaces follow their path, and what they keep",
   "peer": "run time against error, beside MuJoCo's native flex, tolerance by tolerance",
+  "pictures": "pictures a second in many worlds, beside mujoco_warp's renderer",
   "policies": "success of the policies that ship",
   "preconditioner": "iterations with block Jacobi and multilevel",
   "press_error": "what is left of the press's force error",

@@ -1,0 +1,236 @@
+"""Pictures a second of batches' cameras, control steps a second with pixels, and mujoco_warp's.
+
+    palpate bench pictures --device cuda:0
+
+`camera` draws the laparoscope's picture of an exercise in its abdomen in every world, what moved
+brought up to date before: bodies, organs' vertices and normals, and their trees. `exercise` takes
+control steps of the vectorised exercise with random actions, with and without `pixels`.
+`mujoco_warp` is its renderer on the same device, of the same surroundings as meshes and of the
+organ's skin as a flex, beside a tool of 14 shapes; its trees are refitted before each picture too.
+On CUDA work is replayed from a graph.
+"""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import time
+import warnings
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import palpate.batch
+import warp as wp
+from benchmarks import plots, results
+from benchmarks.runner import Bench, Case, Row
+from palpate.tasks import suite
+from palpate.tasks.batch.vector import Exercises
+from palpate.tasks.core import scenes
+
+REPEATS = 10
+_NUMBERS = {"observations": ["sensors"]}
+_MESH, _TEXTURE = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtTexture.mjTEXTURE_2D
+_RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
+
+
+def spec_of(task: str) -> mujoco.MjSpec:
+  """Returns the scene of an exercise."""
+  found = suite.load(*task.split("/"), task_kwargs={"random": 0}).task
+  return found.spec(found.variants[0])
+
+
+def clock(work, device) -> float:
+  """Returns what work takes, replayed on CUDA [s]."""
+  work()
+  again = work
+  if device.is_cuda:
+    with wp.ScopedCapture(device) as capture:
+      work()
+    again = lambda: wp.capture_launch(capture.graph)  # noqa: E731
+    again()
+  wp.synchronize_device(device)
+  start = time.perf_counter()
+  for _ in range(REPEATS):
+    again()
+  wp.synchronize_device(device)
+  return (time.perf_counter() - start) / REPEATS
+
+
+def draw(task: str, nworld: int, size: int, device: str) -> dict:
+  """Returns what pictures of a camera take."""
+  batch = palpate.batch.make(spec_of(task), nworld, device)
+  free = batch.device.free_memory if batch.device.is_cuda else 0
+  camera = batch.camera(scenes.CAMERA, size, size)
+  camera.draw()
+  used = (free - batch.device.free_memory) / nworld if batch.device.is_cuda else float("nan")
+  taken = clock(camera.launch, batch.device)
+  return {"rate": nworld / taken, "world_kB": used / 1e3}
+
+
+def act(task: str, nworld: int, size: int, device: str) -> dict:
+  """Returns what control steps take, with pixels where these have a size."""
+  seen = {"observations": ["sensors", "pixels"], "pixels": (size, size)}
+  output = "torch" if "cuda" in device else "numpy"
+  env = Exercises(nworld, task, device=device, output=output, **(seen if size else _NUMBERS))
+  env.reset(seed=0)
+  actions = np.random.RandomState(0).uniform(-0.3, 0.3, (4, *env.action_space.shape))
+  rows = [wp.array(each, dtype=float, device=env.device) for each in actions]
+  if output == "torch":
+    rows = [wp.to_torch(row) for row in rows]
+  for row in rows:
+    env.step(row)
+  start = time.perf_counter()
+  for k in range(2 * REPEATS):
+    env.step(rows[k % len(rows)])
+  wp.synchronize_device(env.device)
+  taken = (time.perf_counter() - start) / (2 * REPEATS)
+  return {"rate": nworld / taken, "world_kB": float("nan")}
+
+
+def flexed(model: mujoco.MjModel, vert: np.ndarray, face: np.ndarray) -> mujoco.MjModel:
+  """Returns a scene that mujoco_warp draws: skins as meshes, the organ's as a flex, and a tool."""
+  spec, head = mujoco.MjSpec(), model.vis.headlight
+  spec.stat.extent, own = model.stat.extent, spec.visual.headlight
+  spec.visual.map.znear, spec.visual.map.zfar = model.vis.map.znear, model.vis.map.zfar
+  own.ambient, own.diffuse, own.specular = head.ambient, head.diffuse, head.specular
+  for k in np.flatnonzero(model.tex_type == _TEXTURE):
+    shape = model.tex_height[k], model.tex_width[k], model.tex_nchannel[k]
+    data = model.tex_data[model.tex_adr[k] : model.tex_adr[k] + np.prod(shape)]
+    spec.add_texture(
+      name=f"t{k}", type=_TEXTURE, height=shape[0], width=shape[1], nchannel=shape[2], data=data
+    )
+  for k in range(model.nmat):
+    made = spec.add_material(
+      name=f"m{k}", rgba=model.mat_rgba[k], specular=model.mat_specular[k],
+      shininess=model.mat_shininess[k],
+    )  # fmt: skip
+    if model.mat_texid[k, _RGB] >= 0:
+      roles = list(made.textures)
+      roles[_RGB] = f"t{model.mat_texid[k, _RGB]}"
+      made.textures, made.texrepeat = roles, model.mat_texrepeat[k]
+  world = spec.worldbody
+  for k in range(model.nskin):
+    if mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SKIN, k) == f"{scenes.ORGAN}_skin":
+      continue
+    rows = slice(model.skin_vertadr[k], model.skin_vertadr[k] + model.skin_vertnum[k])
+    faces = slice(model.skin_faceadr[k], model.skin_faceadr[k] + model.skin_facenum[k])
+    start = model.skin_texcoordadr[k]
+    spec.add_mesh(
+      name=f"s{k}", uservert=model.skin_vert[rows].ravel(), userface=model.skin_face[faces].ravel(),
+      usertexcoord=model.skin_texcoord[start : start + model.skin_vertnum[k]].ravel(),
+      inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+    )  # fmt: skip
+    world.add_geom(
+      type=_MESH, meshname=f"s{k}", material=f"m{model.skin_matid[k]}", contype=0, conaffinity=0
+    )
+  eye = model.camera(scenes.CAMERA)
+  world.add_camera(name=scenes.CAMERA, pos=eye.pos, quat=eye.quat, fovy=float(eye.fovy[0]))
+  for k in range(model.nlight):
+    world.add_light(
+      pos=model.light_pos[k], dir=model.light_dir[k], type=int(model.light_type[k]),
+      cutoff=model.light_cutoff[k], exponent=model.light_exponent[k], castshadow=False,
+      attenuation=model.light_attenuation[k], ambient=model.light_ambient[k],
+      diffuse=model.light_diffuse[k], specular=model.light_specular[k],
+    )  # fmt: skip
+  world.add_body(name="organ")
+  tool = world.add_body(name="tool", pos=[0.03, 0.05, 0.09])
+  tool.add_freejoint()
+  for k in range(14):
+    tool.add_geom(
+      type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.0025, 0.005, 0], pos=[0, 0, 0.01 * k],
+      contype=0, conaffinity=0,
+    )  # fmt: skip
+  flex = spec.add_flex(name="organ", dim=2, radius=1e-4, rgba=[0.6, 0.2, 0.2, 1])
+  # mujoco_warp has no flex on one body alone: a vertex is another's.
+  vert[-1] -= tool.pos
+  flex.vert, flex.elem = vert.ravel(), face.ravel()
+  flex.vertbody = ["organ"] * (len(vert) - 1) + ["tool"]
+  flex.contype = flex.conaffinity = 0
+  with warnings.catch_warnings():
+    warnings.filterwarnings("ignore", ".*has no equality constraints or passive forces")
+    return spec.compile()
+
+
+def peer(task: str, nworld: int, size: int, device: str) -> dict:
+  """Returns what pictures of mujoco_warp's renderer take."""
+  batch = palpate.batch.make(spec_of(task), 1, "cpu")
+  vert, face = batch.camera(scenes.CAMERA, size, size).skin(scenes.ORGAN)
+  model = flexed(batch.model, vert, face)
+  target = wp.get_device("cpu" if "cpu" in device else device)
+  data = mujoco.MjData(model)
+  mujoco.mj_forward(model, data)
+  with wp.ScopedDevice(target):
+    m, d = mjw.put_model(model), mjw.put_data(model, data, nworld=nworld, nconmax=4, njmax=4)
+    context = mjw.create_render_context(model, nworld, (size, size), True, False, False)
+
+    def work():
+      mjw.refit_bvh(m, d, context)
+      mjw.render(m, d, context)
+
+    return {"rate": nworld / clock(work, target), "world_kB": float("nan")}
+
+
+KINDS = {"camera": draw, "exercise": act, "mujoco_warp": peer}
+
+
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  add = parser.add_argument
+  add("--device", default="warp-cpu", help="warp-cpu or cuda:0 (%(default)s)")
+  add("--tasks", nargs="+", default=["touch/easy", "grasp/easy"])
+  add("--worlds", type=int, help="2 on the CPU, 4096 on CUDA")
+  add("--sizes", type=int, nargs="+", default=[64, 84, 128], help="of pictures (%(default)s)")
+
+
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case a kind, exercise and size; 0 is without pictures."""
+  n = args.worlds or (4096 if "cuda" in args.device else 2)
+  named = [("camera", task, size) for task in args.tasks for size in args.sizes]
+  named += [("mujoco_warp", args.tasks[0], size) for size in args.sizes]
+  named += [("exercise", task, size) for task in args.tasks for size in (84, 0)]
+  cases = [
+    {"case": f"{kind}-{task}-{size}", "kind": kind, "task": task, "size": size, "nworld": n}
+    | {"device": args.device}
+    for kind, task, size in named
+  ]
+  return [cases[:1] if args.short else cases]
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the row of a case."""
+  named = {name: case[name] for name in ("task", "nworld", "size", "device")}
+  return [{"kind": case["kind"], **named, **KINDS[case["kind"]](**named)}]
+
+
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  out = []
+  for kind, what in (("camera", "pictures"), ("mujoco_warp", "pictures of mujoco_warp's renderer")):
+    found = [r for r in rows if r["kind"] == kind and r["size"] == 84]
+    out += [f"`{r['task']}` at 84 x 84: {r['rate']:,.0f} {what} a second." for r in found[:1]]
+  found = [r for r in rows if r["kind"] == "exercise" and r["size"]][:1]
+  text = "with pixels, control steps a second"
+  return out + [f"`{r['task']}` {text}: {r['rate']:,.0f}." for r in found]
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+  head = ["what", "exercise", "worlds", "size", "a second", "a world takes"]
+  lines = plots.table(
+    head,
+    [
+      [r["kind"], r["task"], r["nworld"], r["size"] or "none", f"{r['rate']:,.0f}",
+       "" if np.isnan(r["world_kB"]) else f"{r['world_kB']:.0f} kB"]
+      for r in rows
+    ],
+  )  # fmt: skip
+  title = "Pictures in many worlds"
+  shown = [r for r in rows if r["kind"] != "exercise"]
+  names = [f"{r['kind']} {r['task']} {r['size']}" for r in shown]
+  rates = {"": [r["rate"] for r in shown]}
+  picture = plots.bars(out / "pictures.png", title, names, rates, "pictures a second")
+  return [picture, results.page(out / "pictures.md", title, about, lines, finding(rows), picture)]
+
+
+BENCH = Bench("pictures", stages, run, report=report, arguments=arguments, file="pictures")
