@@ -40,6 +40,8 @@ def add_spare(spec: mujoco.MjSpec, organ: str, spare: int):
   if plugin.config.get("spare") or isinstance(spare, bool) or int(spare) < 1:
     raise ValueError(f"organ {organ!r}: spare is {spare}, expected a number > 0 for one without")
   vertbody = list(flex.vertbody)
+  if len(vertbody) == 1:  # MuJoCo's short form of a rigid flex
+    flex.vertbody = vertbody = vertbody * (len(flex.vert) // 3)
   free = np.array([bodies[name].first_joint() is not None for name in vertbody])
   own = [bodies[name] for name, moves in zip(vertbody, free, strict=True) if moves]
   rest = rest_of(flex, free, own)

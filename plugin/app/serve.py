@@ -33,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   )  # fmt: skip
   add("--pages", metavar="N", type=int, default=2, help="most pages open at a time (%(default)s)")
   add("-o", "--out", metavar="FOLDER", default="out/live", help="of recordings (%(default)s)")
+  add("--scene", metavar="FILE", help="MJCF file with an organ, for free practice")
   keeping.add_arguments(parser)
   add("--open", action="store_true", help="open the page in a browser")
 
@@ -51,8 +52,23 @@ def main(args: argparse.Namespace) -> int:
   check_counts(args, "pages")
   return run(
     pathlib.Path(args.out), args.host, args.port, args.token, args.device, args.pages, args.open,
-    kept=keeping.read(args, pages=True),
+    kept=keeping.read(args, pages=True), scene=_scene(args.scene),
   )  # fmt: skip
+
+
+def _scene(path: str | None) -> str:
+  """Returns the file of an own scene, empty for none; CommandError where it has no organ."""
+  if path is None:
+    return ""
+  from .live.practice import own
+
+  if not pathlib.Path(path).is_file():
+    raise CommandError(f"scene is {path!r}, expected an MJCF file")
+  try:
+    own(pathlib.Path(path), ())
+  except ValueError as error:
+    raise CommandError(str(error)) from None
+  return str(pathlib.Path(path).resolve())
 
 
 def run(
@@ -65,6 +81,7 @@ def run(
   show: bool = True,
   task: str = "",
   kept: keeping.Keeping | None = None,
+  scene: str = "",
 ) -> int:
   """Serves until Ctrl-C and returns the exit code; arguments as the options.
 
@@ -78,13 +95,14 @@ def run(
     show: whether a browser is opened
     task: that is chosen at first
     kept: the record that recordings go to, None for the folder
+    scene: MJCF file for free practice, empty for none
   """
   need("live", "websockets")
   from .live.page.server import Server
 
   folder = output_folder("out", folder)
   try:
-    server = Server(folder, host, port, token, device, pages, kept)
+    server = Server(folder, host, port, token, device, pages, kept, scene)
   except OSError as error:
     raise CommandError(f"cannot listen on {host}:{port}: {error}", code=1) from None
   url = f"{server.url}#task={task}" if task else server.url

@@ -68,6 +68,12 @@ def _init_without_driver():
           print(line, file=sys.stderr)
 
 
+def cuda() -> list[str]:
+  """Returns the names of the CUDA devices."""
+  init()
+  return [device.alias for device in wp.get_cuda_devices()] if wp.is_cuda_available() else []
+
+
 def resolve(name: str, nvert: int) -> wp.Device:
   """Returns the Warp device that `name` asks for; `auto` is the faster one for `nvert` nodes.
 
@@ -77,7 +83,7 @@ def resolve(name: str, nvert: int) -> wp.Device:
   if name == "auto":
     name = "cuda:0" if wp.is_cuda_available() and nvert >= _CUDA_FROM else "cpu"
   if name != "cpu":
-    present = [device.alias for device in wp.get_cuda_devices()] if wp.is_cuda_available() else []
+    present = cuda()
     if name not in present:
       have = ", ".join(present) or "no CUDA device"
       raise ValueError(f"device is {name!r}, but this machine has {have}; expected 'cpu' or 'auto'")

@@ -192,8 +192,7 @@ def table(name: str, policy: str, results: list[Result], reference: Mapping | No
   counts = ", ".join(f"{k} {sum(r.outcome == k for r in results)}" for k in sorted(other))
   lines = [
     f"{name}, policy {policy}, {len(results)} episodes",
-    f"success  {wins}/{len(results)} (95 % interval {span})"
-    + (f"; {counts}" if counts else ""),
+    f"success  {wins}/{len(results)} (95 % interval {span})" + (f"; {counts}" if counts else ""),
     f"{'':28} {'mean':>10} {'SD':>10} {'n':>5}",
   ]
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
 
 from palpate.tasks.metrics import METRICS, Spec, number
 from palpate.tasks.people.report import ending
-from palpate.tasks.people.score import SUCCESS, score
+from palpate.tasks.people.score import SUCCESS, Score, score
 from palpate.tasks.recording import Recording
 
 _STAYS = 0.6  # how long a warning is shown [s]
+_STILL = 1e-3  # path of a hand that has not moved [m]
 # What helps, by metric; those that are left out say so by their names.
 _ADVICE = {
   "peak_force": "approach slowly and stop at the first resistance",
@@ -121,72 +123,79 @@ def _words(text: str) -> str:
   return "".join(c for c in text if not c.isdigit() and c != ".")
 
 
-def advice(recording: Recording, reference: Mapping[str, Any] | None, most: int = 4) -> list[str]:
-  """Returns sentences about an exercise: how it ended, what to do better, what was good.
+@dataclasses.dataclass(frozen=True)
+class Judged:
+  """What an exercise came to.
 
-  Args:
-    recording: of the exercise
-    reference: of skilled people, see `score.make_reference`; without it only the end is known
-    most: sentences about what to do better
+  Attributes:
+    result: against the limits of skilled people, None without them
+    better: metrics that are over their limits, the worst first
+    good: metrics in which the person was better than most skilled people, the best first
   """
-  said = [f"{ending(recording)}."]
+
+  result: Score | None
+  better: tuple[str, ...] = ()
+  good: tuple[str, ...] = ()
+
+
+def judge(recording: Recording, reference: Mapping[str, Any] | None) -> Judged:
+  """Returns what an exercise came to, by a reference of skilled people, see `score`."""
   if reference is None or not len(recording.time):
-    return said
-  metrics = recording.metrics()
-  result = score(metrics, reference, recording.outcome)
-  ended = [name for name in result.over if _tells(METRICS[name], recording)]
-  order, given = sorted(ended, key=lambda name: result.z[name]), set()
-  for name in order[:most]:
-    spec, row = METRICS[name], reference["metrics"][name]
-    unit = "" if spec.shown in ("-", "count") else f" {spec.shown}"
-    bound = "at most" if spec.better == "lower" else "at least"
-    text = (
-      f"{spec.label}: {number(getattr(metrics, name), spec)}{unit}, skilled people have {bound} "
-      f"{number(row['limit'], spec)}{unit}"
-    )
-    single = name == "log_dimensionless_jerk" and metrics.number_of_movements < 2
-    what = "" if single else _ADVICE.get(name, "")  # one movement cannot be made of several
-    said.append(f"{text}: {what}." if what and what not in given else f"{text}.")  # once
-    given.add(what)
+    return Judged(None)
+  result = score(recording.metrics(), reference, recording.outcome)
+  over = [name for name in result.over if _tells(METRICS[name], recording)]
+  good = []
   if recording.outcome == SUCCESS:
     good = [k for k, z in result.z.items() if math.isfinite(z) and z > 0.5 and k not in result.over]
-    good.sort(key=lambda name: -result.z[name])
-    if good:
-      labels = (METRICS[name].label for name in good[:3])
-      labels = ", ".join(label[0].lower() + label[1:] for label in labels)
-      said.append(f"Better than most skilled people: {labels}.")
-    if result.proficient:
-      said.append("Every metric is within its limit: this was a proficient episode.")
-  return said
+  better = sorted(over, key=lambda name: result.z[name])
+  return Judged(result, tuple(better), tuple(sorted(good, key=lambda name: -result.z[name])))
+
+
+def _help(name: str, recording: Recording) -> str:
+  """Returns what helps with a metric; one movement cannot be made of several."""
+  single = name == "log_dimensionless_jerk" and recording.metrics().number_of_movements < 2
+  return "" if single else _ADVICE.get(name, "")
+
+
+def _row(name: str, recording: Recording, reference: Mapping[str, Any] | None) -> dict[str, Any]:
+  """Returns a metric for people: its label, value and limit, with their unit."""
+  spec = METRICS[name]
+  unit = "" if spec.shown in ("-", "count") else f" {spec.shown}"
+  limit = reference["metrics"].get(name) if reference is not None else None
+  return {
+    "label": spec.label,
+    "value": _shown(getattr(recording.metrics(), name), spec) + unit,
+    "limit": number(limit["limit"], spec) + unit if limit else "",
+    "least": spec.better == "higher",
+  }
 
 
 def card(recording: Recording, reference: Mapping[str, Any] | None) -> dict[str, Any]:
-  """Returns the score card of an exercise, JSON."""
-  metrics = recording.metrics()
-  result = None
-  if reference is not None and len(recording.time):
-    result = score(metrics, reference, recording.outcome)
-  rows = []
-  for name, spec in METRICS.items():
-    value = getattr(metrics, name)
-    if not math.isfinite(value) or not _tells(spec, recording):
-      continue
-    limit = "" if result is None else reference["metrics"].get(name)  # pyright: ignore
-    rows.append({
-      "label": spec.label,
-      "group": spec.group,
-      "value": _shown(value, spec),
-      "unit": spec.shown,
-      "limit": number(limit["limit"], spec) if limit else "",
-      "over": result is not None and name in result.over,
-    })  # fmt: skip
-  composite = None
-  if result is not None and math.isfinite(result.composite):
-    composite = round(result.composite, 2)
+  """Returns the score card of an exercise, JSON.
+
+  First what counts: whether it is `done`, what was `good`, what to do `better`; then all metrics in
+  `rows`, and the score of what was done.
+  """
+  metrics, judged = recording.metrics(), judge(recording, reference)
+  result, done = judged.result, recording.outcome == SUCCESS
+  known = reference if len(recording.time) else None
+  rows = [
+    _row(name, recording, known) | {"over": result is not None and name in result.over}
+    for name, spec in METRICS.items()
+    if math.isfinite(getattr(metrics, name)) and _tells(spec, recording)
+  ]
+  score_of = result.composite if done and result is not None else math.nan
+  helps = dict.fromkeys(_help(name, recording) for name in judged.better)
   return {
     "outcome": recording.outcome,
-    "advice": advice(recording, reference),
-    "composite": composite,
+    "done": done,
     "proficient": result is not None and result.proficient,
+    "ending": ending(recording),
+    "good": [METRICS[name].label for name in judged.good[:3]],
+    "better": [_row(name, recording, known) for name in judged.better[:3]],
+    "helps": [what for what in helps if what][:3],
+    "moved": bool(metrics.path_length > _STILL),
+    "composite": round(score_of, 2) if math.isfinite(score_of) else None,
     "rows": rows,
+    "said": [],
   }

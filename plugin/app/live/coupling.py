@@ -22,6 +22,7 @@ from palpate.models.handle import Shaft, times
 from .devices.device import STILL, Device, DeviceError, Four, Guard, Reading, Three
 
 _SAME: Four = (1.0, 0.0, 0.0, 0.0)
+_STIRS, _TURNS = 2e-4, 0.005  # of a hand that begins [m], [rad]
 _CLOSE, _OPEN = 2.0, -0.6  # speed of the jaws by button [1/s], and where they grip
 _RETRY = 0.5  # between tries to find a device again [s]
 # Energy that the hand may get before it gives any, and most that is kept account of [J].
@@ -147,6 +148,8 @@ class Link:
     self._reference: tuple[Reading, list[float], Four, float] | None = None
     self._roll = 0.0
     self._next: Device | None = None
+    self._still: Reading | None = None  # of which a movement is told
+    self._last: Reading | None = None
     self.attach(None, STILL, _SAME, np.eye(3))
     self.quiet()
 
@@ -184,6 +187,19 @@ class Link:
     self._felt_at: Three | None = None
     self._pushed, self._fast = (0.0, 0.0, 0.0, 0.0), 0.0
     self._send(STILL, STILL)
+
+  def moved(self) -> bool:
+    """Returns whether the hand has moved, or pressed a button, since this was asked and it had."""
+    last, still = self._last, self._still
+    if last is None:
+      return False
+    if still is None or last.buttons != still.buttons:
+      self._still, pressed = last, bool(last.buttons)
+      return pressed
+    away = math.dist(last.pos, still.pos) > _STIRS or abs(last.roll - still.roll) > _TURNS
+    if away:
+      self._still = None
+    return away
 
   def change(self, device: Device) -> None:
     """Takes another device with its next reading; to be called from any thread."""
@@ -234,7 +250,7 @@ class Link:
 
   def _take(self, reading: Reading, tip: Sequence[float] | None) -> None:
     """Aims the anchor at what the hand does."""
-    pos, quat, roll, jaw, buttons = reading
+    pos, quat, roll, jaw, buttons = self._last = reading
     asks, self._asked = not self._asked, "pause" in buttons
     self.paused ^= asks and self._asked
     self.grip, self.report = "grip" in buttons, "report" in buttons

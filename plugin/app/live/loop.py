@@ -21,18 +21,24 @@ from .realtime_clock import Pace, punctual
 def tick(pace: Pace, links: Sequence[Link], tips: Sequence[Sequence[float]]) -> bool:
   """Waits for the next step and reads the hands; returns False once the loop is to end.
 
-  In a pause, and while a device is gone, nothing moves, forces are zero, and the devices are still
-  read.
+  In a pause, while a device is gone and until a hand moves where the pace `waits` for it, nothing
+  moves, forces are zero, and the devices are still read.
   """
   pace.wait()
   while not pace.stopped:
     ready = not pace.paused
     for link, tip in zip(links, tips, strict=True):
       ready = link.poll(pace.now, tip) and not link.paused and ready
+    if pace.waits and ready:
+      pace.waits = not any([link.moved() for link in links])
+      ready = not pace.waits
     if ready:
       return True
     for link in links:
-      link.hold()
+      if pace.waits:  # the movement that ends the wait counts
+        link.quiet()
+      else:
+        link.hold()
     pace.rest()
   for link in links:
     link.quiet()

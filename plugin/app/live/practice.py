@@ -4,24 +4,38 @@
 
 from __future__ import annotations
 
+import math
+import pathlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco as mj
 import numpy as np
-from palpate import Organ, models
+import palpate
+from palpate import Organ, models, windows
+from palpate.models import situs, trocar
+from palpate.organ import instances
 
 from .coupling import Link, Options
 from .devices.device import Device
 from .loop import Loop
-from .page.picture import Camera
+from .page.picture import FPS, HOOK, Camera
 from .realtime_clock import Pace
 
 LIMIT, DAMAGE = 1.5, 3.0  # of the force bar [N]
 KEY = "touch"
 SAFE = "implicit"  # scheme that holds at every step
-_FPS = 30
+_SPARE = 8.0  # vertices for cuts, times the square root of the organ's
+_POWER = 30.0  # of a hook's current [W]
+# What cuts an organ, by instrument: as in docs/cutting.md.
+_CUTTERS = {
+  "scalpel": "scalpel/edge",
+  "scissors": "scissors/edge_left scissors/edge_right",
+  "hook": "hook/hook_toe 1.1e6 by hook/current",
+}
+_APART = 0.25  # from the way to the middle of an own scene's organ to each port, in its sizes
+_EYE = (0.2, 1.0, 1.2)  # where its laparoscope looks from, in its sizes
 _FAR = 0.5  # a node that is further off its place than any organ is large [m]
 _BUSY = 0.7  # share of the time in steps from which on a loop does not go before all others
 _TRIED = 20  # steps that are timed for that
@@ -50,6 +64,8 @@ class Practice:
     options: Options | None = None,
     publish: Callable[[Practice], None] | None = None,
     pace: Pace | None = None,
+    on: str = "",
+    scene: pathlib.Path | None = None,
   ):
     """Prepares the scene.
 
@@ -60,20 +76,29 @@ class Practice:
       step: of the physics [s]
       scheme: time stepping, see `integrator` in docs/configuration.md
       options: of the coupling
-      publish: called before the first step, and then 30 times a second at most, in the loop's
+      publish: called before the first step, and then `FPS` times a second at most, in the loop's
         thread, to copy what pictures need
       pace: real time by default
+      on: device that the organ is computed on, such as "cuda:0"; empty for its own choice
+      scene: MJCF file in place of `organ` and `size`
     """
-    spec = models.load(organ, instruments=tuple(hands), handle=True, coupling="window", **size)  # pyright: ignore
+    made = own(scene, tuple(hands)) if scene else furnished(organ, size, tuple(hands))
+    spec, name = made
+    if on:
+      _, plugin, _ = windows.find_organ(spec, name)
+      plugin.config = {k: v for k, v in plugin.config.items() if v} | {"device": on}
     self.model: Any = spec.compile()
     self.model.opt.timestep = step
     self.data: Any = mj.MjData(self.model)
-    mj.mj_resetDataKeyframe(self.model, self.data, self.model.key(KEY).id)
-    mj.mj_forward(self.model, self.data)
-    self.organ = Organ(self.model, self.data, f"{organ}/{organ}")
+    self._key = mj.mj_name2id(self.model, mj.mjtObj.mjOBJ_KEY, KEY)
+    self._place()
+    self.organ = Organ(self.model, self.data, name)
+    found = mj.mj_name2id(self.model, mj.mjtObj.mjOBJ_ACTUATOR, f"{HOOK}current")
+    self._current = found if found >= 0 else None
     self._wanted, self._publish, self._due = scheme, publish, 0.0
     self.pace, self.faults = pace or Pace(step), []
     named = {f"{name}/": device for name, device in hands.items()}
+    self._names = list(named)
     self._loop = Loop(self.model, self.data, named, options, self.pace)
     self.links: list[Link] = self._loop.links
     self.camera = Camera(self.model, self.data, self.organ, next(iter(named)))
@@ -82,6 +107,12 @@ class Practice:
   def link(self) -> Link:
     """The right hand's."""
     return self.links[0]
+
+  @property
+  def powered(self) -> bool:
+    """Whether a hook's current is on."""
+    hands = zip(self._names, self.links, strict=True)
+    return any(link.grip for name, link in hands if name == HOOK)
 
   def change(self, scheme: str) -> None:
     """Takes another scheme with the next step."""
@@ -118,9 +149,11 @@ class Practice:
       self._look(self)
     if self._wanted != self.organ.integrator:
       self._switch()
+    if self._current is not None:
+      self.data.ctrl[self._current] = _POWER * self.powered
     if self.pace.now < self._due:
       return
-    self._due = max(self._due + 1 / _FPS, self.pace.now)
+    self._due = max(self._due + 1 / FPS, self.pace.now)
     error = self.organ.error
     if error or not np.abs(self.organ.displacement).max() < _FAR:
       self._diverged()
@@ -143,8 +176,16 @@ class Practice:
     self._switch()
     self._restart()
 
+  def _place(self) -> None:
+    """Begins: where the keyframe of that name is, if there is one."""
+    if self._key >= 0:
+      mj.mj_resetDataKeyframe(self.model, self.data, self._key)
+    else:
+      mj.mj_resetData(self.model, self.data)
+    mj.mj_forward(self.model, self.data)
+
   def _restart(self) -> None:
-    mj.mj_resetDataKeyframe(self.model, self.data, self.model.key(KEY).id)
+    self._place()
     self.organ.reset()
     mj.mj_forward(self.model, self.data)
     self._loop.attach()
@@ -152,3 +193,80 @@ class Practice:
   def _note(self, fault: str) -> None:
     if fault and (not self.faults or self.faults[-1] != fault):
       self.faults.append(fault)
+
+
+def furnished(
+  organ: str, size: Mapping[str, int], instruments: Sequence[str]
+) -> tuple[mj.MjSpec, str]:
+  """Returns a scene of an organ in the abdomen, and its name; what cuts may cut it.
+
+  A regular grid lies alone, for it has no texture.
+  """
+  spec = models.load(organ, instruments=instruments, handle=True, coupling="window", **size)  # pyright: ignore
+  name = f"{organ}/{organ}"
+  _cut(spec, name, instruments)
+  if "nodes" in size:
+    situs.enter(spec, organ, size["nodes"])
+  return spec, name
+
+
+def _cut(spec: mj.MjSpec, name: str, instruments: Sequence[str]) -> None:
+  """Gives an organ vertices for cuts by those of the instruments that cut."""
+  cutters = [_CUTTERS[each] for each in instruments if each in _CUTTERS]
+  flex, plugin, _ = windows.find_organ(spec, name)
+  if not cutters or plugin.config.get("cutters"):
+    return
+  if not plugin.config.get("spare"):
+    palpate.add_spare(spec, name, round(_SPARE * math.sqrt(int(np.max(flex.elem)) + 1)))
+  config = {key: value for key, value in plugin.config.items() if value}
+  plugin.config = config | {"cutters": ", ".join(cutters)}
+  if "hook" in instruments:
+    current = spec.add_actuator(
+      name=f"{HOOK}current", trntype=mj.mjtTrn.mjTRN_SITE, target=f"{HOOK}tip"
+    )
+    current.gainprm[0] = 0.0
+
+
+def own(path: pathlib.Path, instruments: Sequence[str]) -> tuple[mj.MjSpec, str]:
+  """Returns somebody's own scene with instruments in it, and the name of its first organ.
+
+  A camera `laparoscope` is added where there is none. The instruments come through ports in the
+  direction of that camera, and point at the organ's middle.
+
+  Raises:
+    ValueError: it is no MJCF, or has no organ.
+  """
+  spec = mj.MjSpec.from_file(str(path))
+  model = spec.compile()
+  names = list(instances(model))
+  if not names:
+    raise ValueError(f"scene {path}: it has no organ, expected a flexcomp with the plugin's")
+  data = mj.MjData(model)
+  mj.mj_forward(model, data)
+  x = Organ(model, data, names[0]).xpos
+  middle, size = x.mean(axis=0), float(np.ptp(x, axis=0).max())
+  for key in list(spec.keys):  # they know nothing of the instruments
+    spec.delete(key)
+  eye = middle + size * np.array(_EYE)
+  if mj.mj_name2id(model, mj.mjtObj.mjOBJ_CAMERA, "laparoscope") < 0:
+    right = np.cross(middle - eye, [0.0, 0.0, 1.0])
+    up = np.cross(right, middle - eye)
+    spec.worldbody.add_camera(name="laparoscope", pos=eye, fovy=50.0, quat=_turn(right, up))
+  else:
+    eye = data.cam_xpos[model.camera("laparoscope").id]
+  toward = (eye - middle) / np.linalg.norm(eye - middle)
+  aside = np.cross([0.0, 0.0, 1.0], toward)
+  aside /= np.linalg.norm(aside)
+  reach = float(((x - middle) @ toward).max()) + trocar.DEPTH + 0.02
+  for instrument, side in zip(instruments, (1, -1), strict=False):
+    port = middle + reach * toward + side * _APART * size * aside
+    trocar.attach(spec, instrument, f"{instrument}/", port, trocar.aim(port, middle), handle=True)
+  return spec, names[0]
+
+
+def _turn(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+  """Returns the orientation whose first axes go these ways, w x y z."""
+  x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
+  quat = np.zeros(4)
+  mj.mju_mat2Quat(quat, np.stack([x, y, np.cross(x, y)], axis=1).ravel())
+  return quat

@@ -95,10 +95,11 @@ class Lateness:
 class Pace:
   """Gives the steps of a loop their time.
 
-  Other threads may set `paused`, `stopped` and `speed`.
+  Other threads may set `paused`, `waits`, `stopped` and `speed`.
 
   Attributes:
     paused: whether the steps wait
+    waits: whether they wait for a hand's next movement
     stopped: whether the loop is to end
     speed: 1 is real time, 0.5 slow motion
     lateness: so far
@@ -125,7 +126,7 @@ class Pace:
     if not 0.01 <= speed <= 10:
       raise ValueError(f"speed is {speed}, expected a number in [0.01, 10]")
     self.period, self.speed = period, speed
-    self.paused = self.stopped = False
+    self.paused = self.waits = self.stopped = False
     self.lateness = Lateness()
     self._clock, self._sleep = clock, sleep
     self._due, self.now = None, 0.0

@@ -18,7 +18,7 @@ from .devices.device import Device
 from .loop import axes, tick
 from .realtime_clock import Pace, punctual
 
-_FPS = 30  # of what is published
+_FPS = 60  # of what is published
 # What a hand says for each of the components that do not move its instrument as a whole.
 _SAYS: dict[str, Callable[[Link], float]] = {
   "jaw": lambda link: link.jaw,
@@ -64,7 +64,7 @@ class Session:
       options: of the coupling
       pace: real time by default
       coach: looks on after every control step, see `coach.Coach`
-      publish: called before the first step, and then 30 times a second, in the loop's thread: to
+      publish: called before the first step, and then 60 times a second, in the loop's thread: to
         copy what pictures need, no more
       other: device of the other hand, where the exercise has two
       journal: file that takes the exercise second by second, see `Recorder`

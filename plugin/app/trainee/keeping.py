@@ -131,15 +131,22 @@ class Keeping:
     """Returns the tasks that are not open to the trainee, each with the one that comes first."""
     from palpate.tasks.people import curriculum
 
+    passed = self.passed()
+    if passed is None or self.any_task:
+      return {}
+    met = curriculum.done(passed)
+    found = {task: curriculum.locked(task, met) for task in curriculum.AFTER}
+    return {task: before for task, before in found.items() if before}
+
+  def passed(self) -> Mapping[str, Sequence[bool]] | None:
+    """Returns task -> whether each attempt of the trainee was proficient, None without a record."""
     from . import history
     from .record import Record
 
-    if self.folder is None or not self.trainee or self.any_task:
-      return {}
+    if self.folder is None or not self.trainee:
+      return None
     with Record(self.folder) as record:
-      met = curriculum.done(history.passed(record.episodes(record.find(self.trainee))))
-    found = {task: curriculum.locked(task, met) for task in curriculum.AFTER}
-    return {task: before for task, before in found.items() if before}
+      return history.passed(record.episodes(record.find(self.trainee)))
 
   def knows(self, person: str) -> bool:
     """Returns whether what a person did goes to a record; a trainee does everything."""

@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 import palpate
 import pytest
-from palpate.app.live.coach import Coach, advice, card
+from palpate.app.live.coach import Coach, card
 from palpate.tasks import suite
 from palpate.tasks.core import episode, performer
 from palpate.tasks.people.score import reference
@@ -79,31 +79,36 @@ def test_an_assessment_is_silent():
   assert coach.log() == {"assessment": True, "hints": []}
 
 
-def test_advice_names_what_is_over_its_limit_and_what_helps():
+def test_a_card_says_what_was_good_what_to_do_next_and_what_helps():
   env = load("touch/easy")
   made = episode.run(env, performer.make(env, seed=0), 0, {"task_kwargs": {}})
   strict = copy.deepcopy(reference("touch/easy"))
   strict["metrics"]["path_length"]["limit"] = 0.001  # [m]
-  said = advice(made, strict)
-  assert said[0].startswith("Success, after")
-  assert any("skilled people have at most 1 mm: go straight" in text for text in said)
-  assert advice(made, None) == said[:1]
   shown = card(made, strict)
+  assert shown["done"] and shown["ending"].startswith("Success, after") and shown["moved"]
+  (row,) = shown["better"]
+  assert (row["label"], row["limit"], row["least"]) == ("Path length", "1 mm", False)
+  assert shown["helps"] == ["go straight to the target"]
   over = {row["label"] for row in shown["rows"] if row["over"]}
   assert over == {"Path length"} and shown["outcome"] == "success" and not shown["proficient"]
+  unjudged = card(made, None)
+  assert unjudged["better"] == unjudged["good"] == [] and unjudged["composite"] is None
   stopped = dataclasses.replace(made, info={**made.info, "outcome": "damage"})
-  assert "Failed: a force above" in advice(stopped, reference("touch/easy"))[0]
-  rows = {row["label"]: row["value"] for row in card(stopped, strict)["rows"]}
+  failed = card(stopped, strict)
+  assert "Failed: a force above" in failed["ending"]
+  assert not failed["done"] and failed["composite"] is None  # -20 says nothing to a person
+  rows = {row["label"]: row["value"] for row in failed["rows"]}
   assert "Path length" not in rows and "Peak force" in rows  # what ends early is short
   assert "Time to completion" not in rows
-  assert "Path length" not in "".join(advice(stopped, strict))
+  assert "Path length" not in [row["label"] for row in failed["better"]]
 
 
-def test_advice_asks_for_one_movement_where_there_were_several():
+def test_one_smooth_movement_is_asked_for_where_there_were_several():
   env = load("touch/easy")
   made = episode.run(env, performer.make(env, seed=0), 0, {"task_kwargs": {}})
   strict = copy.deepcopy(reference("touch/easy"))
   strict["metrics"]["log_dimensionless_jerk"]["limit"] = 0.0
   several = made.metrics().number_of_movements > 1
-  (text,) = [text for text in advice(made, strict) if text.startswith("Log dimensionless jerk")]
-  assert ("one smooth movement" in text) == several
+  shown = card(made, strict)
+  assert "Log dimensionless jerk" in [row["label"] for row in shown["better"]]
+  assert any("one smooth movement" in text for text in shown["helps"]) == several

@@ -68,7 +68,7 @@ def test_an_exercise_on_the_page_is_kept_and_what_is_locked_refused(page, folder
   assert said["type"] == "error" and "not open to 'Ada' yet: touch/standard" in said["text"]
   first = do(one, task="touch/easy", person="Bo")  # who does it is said by the command
   do(one, task="touch/easy", assessment=True)
-  assert first["advice"][-1].startswith("Attempt 1 at touch/easy") and not first["fault"]
+  assert first["said"][-1].startswith("Attempt 1 at touch/easy") and not first["fault"]
   assert Recording.load(first["path"]).outcome == "stopped"
   assert folder in pathlib.Path(first["path"]).parents and not (tmp_path / "live").exists()
   with Record(folder) as record:
@@ -98,7 +98,7 @@ def test_references_need_no_record(page, tmp_path):
 def test_a_name_on_a_page_is_kept_apart_and_nothing_is_told(page, folder, tmp_path):
   one = page(keeping.Keeping(folder))
   cards = [do(one, task="touch/easy", person=name) for name in ("Ada", "Bo", "")]
-  assert not any("Attempt" in line for card in cards for line in card["advice"])
+  assert not any("Attempt" in line for card in cards for line in card["said"])
   assert [folder in pathlib.Path(card["path"]).parents for card in cards] == [True, True, False]
   assert pathlib.Path(cards[2]["path"]).parent == tmp_path / "live"  # nobody's
   with Record(folder) as record:

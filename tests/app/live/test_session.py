@@ -109,11 +109,11 @@ def test_a_device_that_stumbles_is_in_the_recording():
   assert any("expected finite numbers" in fault for fault in made.info["live"]["faults"])
 
 
-def test_pictures_are_of_thirty_moments_a_second():
+def test_pictures_are_of_fifty_moments_a_second_or_more():
   env = load(time_limit=1)
   times = []
   session(env, live.Hand(), publish=lambda s: times.append(s.env.physics.time())).run()
-  assert 28 <= len(times) <= 32
+  assert 50 <= len(times) <= 62  # none beside the end of a control step
 
 
 def test_two_hands_move_two_instruments_and_what_they_do_replays(tmp_path):

@@ -12,17 +12,18 @@ from ...trainee.record import check_name
 NODES = (250, 500, 1000, 2000, 4000)  # of an exercise
 SPEEDS = (0.1, 0.25, 0.5, 1.0)
 SCHEMES = tuple(step.SCHEMES)
+OWN = "own scene"  # in free practice, that of --scene
 STEPS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [ms]
-BLUNT = ("scissors", "hook", "scalpel")  # in free practice, whose organs have no spare vertices
 OTHER = ("", "keyboard", "pad")  # what a page can have for the left hand; none by default
 
 
-def offer(device: str, kept: Keeping | None = None) -> dict[str, Any]:
+def offer(device: str, kept: Keeping | None = None, scene: bool = False) -> dict[str, Any]:
   """Returns what a page offers, JSON.
 
   Args:
     device: that the program was started with
     kept: whose exercises they are
+    scene: whether there is an own scene to practise on
   """
   from palpate import models
   from palpate.tasks import suite
@@ -32,19 +33,41 @@ def offer(device: str, kept: Keeping | None = None) -> dict[str, Any]:
     "tasks": {name: suite.summary(*suite.split(name)) for name in _order()},
     "trainee": kept.trainee if kept else "",
     "locked": kept.locked() if kept else {},
+    "progress": _progress(kept),
     "two": ["/".join(pair) for pair in suite.BIMANUAL],
     "nodes": NODES,
     "speeds": SPEEDS,
     "device": device,
     "devices": devices(device),
     "lefts": lefts(device),
-    "organs": models.NAMES,
+    "organs": organs(scene),
     "meshes": meshes(),
     "schemes": SCHEMES,
     "steps": STEPS,
     "instruments": models.INSTRUMENTS,
-    "blunt": BLUNT,
+    "processors": processors(),
   }
+
+
+def _progress(kept: Keeping | None) -> dict[str, dict[str, Any]] | None:
+  """Returns what a trainee has done, None where nobody keeps it: attempts, proficient, rule met."""
+  from palpate.tasks.people import curriculum
+
+  passed = kept.passed() if kept else None
+  if passed is None:
+    return None
+  met = curriculum.done(passed)
+  return {
+    task: {"tried": len(each), "good": sum(each), "met": task in met}
+    for task, each in passed.items()
+  }
+
+
+def organs(scene: bool) -> tuple[str, ...]:
+  """Returns what there is for free practice, an own scene first."""
+  from palpate import models
+
+  return (OWN, *models.NAMES) if scene else models.NAMES
 
 
 def _order() -> list[str]:
@@ -67,6 +90,13 @@ def devices(device: str) -> tuple[str, ...]:
 def lefts(device: str) -> tuple[str, ...]:
   """Returns the names of what may be in the left hand."""
   return (*OTHER, *devices(device)[1:])
+
+
+def processors() -> tuple[str, ...]:
+  """Returns what organs of free practice can be computed on."""
+  from palpate.tissue import device
+
+  return ("cpu", *device.cuda())
 
 
 def meshes() -> tuple[str, ...]:
@@ -105,7 +135,7 @@ def exercise(message: dict[str, Any], device: str) -> dict[str, Any]:
   }
 
 
-def practice(message: dict[str, Any], device: str) -> dict[str, Any]:
+def practice(message: dict[str, Any], device: str, scene: bool = False) -> dict[str, Any]:
   """Returns the free practice that a message asks for; ValueError names what is wrong with it."""
   from palpate import models
 
@@ -116,13 +146,14 @@ def practice(message: dict[str, Any], device: str) -> dict[str, Any]:
   count, _, kind = mesh.partition(" ")
   return _common(message) | {
     "type": "practice",
-    "organ": chosen("organ", "liver", models.NAMES),
+    "organ": chosen("organ", OWN if scene else "liver", organs(scene)),
     "mesh": mesh,
     "size": {"nodes" if kind == "nodes" else "grid": int(count)},
     "scheme": chosen("scheme", "implicit", SCHEMES),
     "step": chosen("step", 1.0, STEPS),
     "instrument": chosen("instrument", "probe", models.INSTRUMENTS),
     "left": chosen("left", "", lefts(device)),
+    "on": chosen("on", "cpu", processors()),
   }
 
 

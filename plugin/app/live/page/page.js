@@ -1,7 +1,10 @@
 // The page: picks an exercise, shows it and sends what the hands do.
 import {kept, show} from "./card.js";
 import {CLOCK, Hand} from "./hand.js";
+import * as home from "./home.js";
 import {Plot} from "./plots.js";
+import {language, speak, t} from "./texts.js";
+import {PRACTICE, Tutorial} from "./tutorial.js";
 import {View} from "./view.js";
 
 const $ = id => document.getElementById(id);
@@ -10,19 +13,25 @@ const MEAN = 0.3;  // over which steps are counted [s]
 const AGAIN = 2000;  // between tries to reach the program [ms]
 const WORDS = 100;  // between numbers in words, which are laid out anew [ms]
 const ENOUGH = 40, PROMPT = 0.9;  // frames to judge by whether most of them are drawn
+const LONGEST = 100;  // that a picture lies behind what came [ms]
 const KEPT = 5000;  // of the times from hand to picture
 const TONES = {force: [880, 0.1], shaft: [660, 0.1], view: [330, 0.15], end: [523, 0.3]};  // [Hz], [s]
 
+const asked = new URLSearchParams(location.hash.slice(1));
+speak();
 let view;
 try {
-  view = new View($("view"));
+  view = new View($("view"), asked.get("look") === "wet");
 } catch (error) {
-  $("welcome").textContent = `${error.message}: try another browser, or switch on its hardware acceleration`;
+  without(error);
   throw error;
 }
-let two = [];  // exercises for two hands
+let offer = null;  // of the program: exercises, devices, ...
+let tutorial = null;
 let scene = null, frame = null, head = {}, rest = null, running = false, paused = false, sound = null;
 let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble = "", warned = "", late = null;
+let last = null, arrived = 0, span = 0, mixed = null;  // frames between which pictures lie [ms]
+let waited = false;  // for a movement
 let turn = 0, told = 0, came = 0, shown = 0;
 const plots = {force: new Plot("force"), way: new Plot("way"), rate: new Plot("rate")};
 const ways = [], pictures = [];  // from hand to picture [ms]; when pictures were drawn
@@ -47,7 +56,7 @@ function connect() {
   socket.onclose = () => {
     run(false);
     $("start").disabled = true;
-    if (!trouble) tell("No connection to the program. Recordings are kept. Connecting again");
+    if (!trouble) tell(t("No connection to the program. Recordings are kept. Connecting again"));
     setTimeout(connect, AGAIN);
   };
 }
@@ -59,46 +68,52 @@ const HEAR = {
   menu(menu) {
     trouble = "";
     tell("");
+    const first = !offer;
+    offer = menu;
     const groups = Object.groupBy?.(Object.keys(menu.tasks), name => name.split("/")[0]) ?? {"": Object.keys(menu.tasks)};
     keep("task", () => $("task").replaceChildren(...Object.entries(groups).map(([domain, names]) => {
       const group = document.createElement("optgroup");
       group.label = domain;
       group.append(...names.map(name => {
         const after = menu.locked[name];
-        const option = new Option(`${name}: ${menu.tasks[name]}${after ? ` (after ${after})` : ""}`, name);
+        const option = new Option(`${name}: ${menu.tasks[name]}${after ? ` (${t("after {0}", after)})` : ""}`, name);
         option.disabled = Boolean(after);
         return option;
       }));
       return group;
     })));
-    fill("nodes", [["", "default"], ...menu.nodes.map(n => [n, `${n} nodes`])]);
-    fill("speed", menu.speeds.map(s => [s, s === 1 ? "real time" : `${s} \u00d7 real time`]).reverse());
+    fill("nodes", [["", t("default")], ...menu.nodes.map(n => [n, t("{0} nodes", n)])]);
+    fill("speed", menu.speeds.map(s => [s, s === 1 ? t("real time") : t("{0} \u00d7 real time", s)]).reverse());
     fill("scale", [1, 0.5, 0.25, 2].map(s => [s, `${s} : 1`]));
-    fill("device", menu.devices.map(name => [name, name === "page" ? "mouse, touch, keys, gamepad" : name]));
-    fill("left", menu.lefts.map(name => [name, {"": "none", keyboard: "keyboard, on this page", pad: "gamepad, on this page"}[name] ?? name]));
+    fill("device", menu.devices.map(name => [name, name === "page" ? t("mouse, touch, keys, gamepad") : name]));
+    fill("left", menu.lefts.map(name => [name, t({"": "none", keyboard: "keyboard, on this page", pad: "gamepad, on this page"}[name] ?? name)]));
     for (const name of ["organ", "mesh", "scheme", "instrument"]) {
-      fill(name, menu[`${name === "mesh" ? "meshe" : name}s`].map(value => [value, value.replace("_", " ") + (menu.blunt.includes(value) ? " (does not cut here)" : "")]));
+      fill(name, menu[`${name === "mesh" ? "meshe" : name}s`].map(value => [value, value.replace("_", " ")]));
     }
     fill("step", menu.steps.map(value => [value, `${value} ms`]));
     if (!scene) [$("step").value, $("mesh").value] = [1, "1000 nodes"];
     if (menu.devices.includes(menu.device)) $("device").value = menu.device;
-    const wanted = new URLSearchParams(location.hash.slice(1)).get("task");
+    const wanted = asked.get("task"), {next} = home.standing(menu);
     if (wanted in menu.tasks && !(wanted in menu.locked)) $("task").value = wanted;
-    if ($("task").selectedOptions[0]?.disabled) $("task").value = Object.keys(menu.tasks).find(name => !(name in menu.locked));
+    else if (first || $("task").selectedOptions[0]?.disabled) $("task").value = next;
+    if (first) mode(wanted in menu.tasks ? "exercise" : "home");
+    home.show($("cards"), menu, choose);
     if (menu.trainee) [$("person").value, $("person").disabled] = [menu.trainee, true];
-    two = menu.two;
+    fill("on", menu.processors.map(name => [name, name]));
+    $("processors").hidden = menu.processors.length < 2;
     hands();
     $("start").disabled = false;
     document.body.dataset.device = menu.device;
   },
   loading({text, note}) {
     tell("");
-    $("instruction").textContent = `Loading ${text}${note}`;
+    $("welcome").replaceChildren();
+    $("instruction").textContent = t(note ? "Loading {0}, which takes a minute or more" : "Loading {0}", text);
   },
   scene(message) {
     scene = message;
-    frame = rest = trace = before = null;
-    came = shown = 0;
+    frame = last = rest = trace = before = null;
+    came = shown = told = 0;
     pressed("ghost", false);
     view.load(scene);
     for (const plot of Object.values(plots)) plot.clear();
@@ -108,18 +123,23 @@ const HEAR = {
     $("pad-report").hidden = !scene.report;
     run(true);
   },
+  topology(message) {
+    view.sew(message);
+    rest = null;
+  },
   status({instruction, warning, kind, fault, scheme}) {
-    $("instruction").textContent = scene?.assessment ? "Assessment: no help" : instruction;
+    if (!tutorial) $("instruction").textContent = scene?.assessment ? t("Assessment: no help") : t(instruction);
     if (kind && kind !== warned) beep(kind);
     warned = kind;
-    $("warning").textContent = warning;
+    $("warning").textContent = t(warning);
     $("stage").dataset.warning = kind;
     if (fault !== trouble) tell(trouble = fault);
     if (scheme) $("scheme").value = scheme;
   },
   ghost(message) {
     trace = message;
-    tell("");
+    tell(t("The clock is stopped; it goes on when you move"));
+    waited = true;
     const path = [];
     for (const pose of trace.pose) {
       const last = path.at(-1) ?? [1, 1, 1];
@@ -131,9 +151,12 @@ const HEAR = {
   card(message) {
     run(false);
     beep("end");
-    const save = message.fault ? [["Save again", () => say({type: "keep"})]] : [];
-    const again = ["Try again", () => ($("card").close(), start())];
-    show($("card"), message, [...save, again, ["Close", () => $("card").close()]]);
+    home.note($("task").value, message);
+    const {next} = home.standing(offer), save = message.fault ? [[t("Save again"), () => say({type: "keep"})]] : [];
+    const again = [t("Try again"), () => ($("card").close(), start())];
+    const on = message.done && next && next !== $("task").value ? [[t("Next: {0}", next), () => ($("card").close(), choose(next))]] : [];
+    show($("card"), message, [...save, ...on, again, [t("Close"), () => $("card").close()]]);
+    home.show($("cards"), offer, choose);
   },
   kept({path, fault}) {
     $("kept")?.replaceWith(kept(path, fault));
@@ -162,30 +185,55 @@ function keep(name, change) {
 
 // What runs.
 
-const practice = () => document.body.dataset.mode === "practice";
+const MODES = ["home", "tutorial", "exercise", "practice"];
+const practice = () => ["practice", "tutorial"].includes(document.body.dataset.mode);
 function mode(name) {
+  if (running && name !== document.body.dataset.mode) say({type: "stop"});
   document.body.dataset.mode = name;
-  for (const each of ["exercise", "practice"]) $(`tab-${each}`).setAttribute("aria-selected", each === name);
-  $("welcome").textContent = name === "practice" ? "Choose an organ and press Start. Every choice may be changed while it runs."
-    : "Choose an exercise and press Start.";
+  for (const each of MODES) $(`tab-${each}`).setAttribute("aria-selected", each === name);
+  $("welcome").textContent = t(name === "practice" ? "Choose an organ and press Start. Every choice may be changed while it runs."
+    : "Choose an exercise and press Start.");
   hands();
+}
+function choose(task) {
+  mode("exercise");
+  $("task").value = task;
+  hands();
+  start();
+}
+function teach() {
+  mode("tutorial");
+  start();
+}
+
+// What is left to a browser that cannot draw: the exercise as a film.
+function without(error) {
+  mode("exercise");
+  const film = document.createElement("code"), picture = new Image(), task = asked.get("task") ?? "touch/easy";
+  film.textContent = `palpate render ${task} --seconds 10 -o film.mp4`;
+  picture.src = `cards/${task.replace("/", "_")}.webp`;
+  $("welcome").replaceChildren(t("This browser draws no WebGL 2"), picture,
+    t("Switch on its hardware acceleration, or try another browser. The exercise as a film, from the command line:"), film);
+  console.warn(error);
 }
 
 // An exercise for two hands asks for the other one's device: the keys, where nothing is chosen.
 function hands() {
-  const both = !practice() && two.includes($("task").value);
+  const both = !practice() && offer?.two.includes($("task").value);
   $("other").hidden = !practice() && !both;
   if (both && !$("left").value) $("left").value = "keyboard";
 }
 
 function run(on) {
   running = on;
+  document.body.classList.toggle("running", on);
   paused = false;
-  $("pause").textContent = "Pause";
+  $("pause").textContent = t("Pause");
   $("pause").disabled = $("stop").disabled = !on;
   $("start").disabled = on;
   $("ghost").disabled = !on || !scene || scene.practice || scene.assessment;
   $("welcome").hidden = on || Boolean(frame);
+  if (!on) tutorial = null;
   hand.release();
   if (on) $("welcome").textContent = "";
   else {
@@ -201,14 +249,18 @@ function start() {
   tell("");
   $("welcome").textContent = "";
   const common = {speed: Number($("speed").value), scale: Number($("scale").value)};
-  if (practice()) {
+  tutorial = document.body.dataset.mode === "tutorial" ? new Tutorial() : null;
+  if (tutorial) {
+    hand.left = "";
+    say({...PRACTICE, ...common});
+  } else if (practice()) {
     hand.left = $("left").value;
     say({
       type: "practice", organ: $("organ").value, mesh: $("mesh").value, scheme: $("scheme").value, left: hand.left,
-      instrument: $("instrument").value, step: Number($("step").value), ...common,
+      instrument: $("instrument").value, step: Number($("step").value), on: $("on").value, ...common,
     });
   } else {
-    hand.left = two.includes($("task").value) ? $("left").value : "";
+    hand.left = offer.two.includes($("task").value) ? $("left").value : "";
     say({
       type: "start", task: $("task").value, left: hand.left, seed: Number($("seed").value), person: $("person").value,
       nodes: $("nodes").value ? Number($("nodes").value) : null, assessment: $("assessment").checked, ...common,
@@ -219,9 +271,10 @@ function start() {
 
 function take(numbers) {
   if (!scene) return;
-  const from = scene.head.length, nodes = numbers.subarray(from, from + 3 * scene.nodes);
+  const from = scene.head.length, nodes = numbers.subarray(from, numbers.length - 12 * scene.bodies - 19 * scene.sites.length);
   head = Object.fromEntries(scene.head.map((name, i) => [name, numbers[i]]));
-  frame = numbers;
+  const now = performance.now();
+  [last, frame, span, arrived] = [frame, numbers, Math.min(now - arrived, LONGEST), now];
   fresh = true;
   came++;
   rest ??= nodes.slice();
@@ -229,11 +282,11 @@ function take(numbers) {
   plots.force.push(head.force);
   plots.way.push(1e3 * displacement(nodes));
   before ??= head;
-  const span = head.clock - before.clock;
-  if (span > MEAN) {
+  const passed = head.clock - before.clock;
+  if (passed > MEAN) {
     const steps = head.steps - before.steps;
-    plots.rate.push(steps / span);
-    report(steps / span, 1 - (head.missed - before.missed) / Math.max(steps, 1), (head.time - before.time) / span);
+    plots.rate.push(steps / passed);
+    report(steps / passed, 1 - (head.missed - before.missed) / Math.max(steps, 1), (head.time - before.time) / passed);
     before = head;
   }
   const most = Math.max(scene.damage, 1.2 * limit);
@@ -245,11 +298,17 @@ function take(numbers) {
   $("force").lastElementChild.style.left = `${100 * limit / most}%`;
   if (performance.now() - told < WORDS) return;
   told = performance.now();
-  $("force-text").textContent = `${head.force.toFixed(2)} N, limit ${limit} N`;
-  $("progress").value = Math.max(head.progress, 0);
-  $("progress-text").textContent = `${Math.round(100 * Math.max(head.progress, 0))} %`;
-  const state = STATES[head.state], limited = scene.time_limit ? ` of ${scene.time_limit.toFixed(0)}` : "";
-  $("time").textContent = `${head.time.toFixed(1)}${limited} s${state === "ready" ? "" : `, ${state}`}`;
+  const lesson = tutorial?.look(head, scene.camera), done = Math.max(lesson ? lesson[1] : head.progress, 0);
+  if (lesson) $("instruction").textContent = lesson[0];
+  $("force-text").textContent = t("{0} N, limit {1} N", head.force.toFixed(2), limit);
+  $("progress").value = done;
+  $("progress-text").textContent = `${Math.round(100 * done)} %`;
+  const state = STATES[head.state], seconds = head.time.toFixed(1);
+  const time = scene.time_limit ? t("{0} of {1} s", seconds, scene.time_limit.toFixed(0)) : `${seconds} s`;
+  $("time").textContent = state === "ready" ? time : `${time}, ${t(state)}`;
+  if (state === "waiting" && !scene.practice) tell(t(head.time < 0.1 ? "The clock starts with your first movement" : "The clock is stopped; it goes on when you move"));
+  else if (waited) tell("");
+  waited = state === "waiting" && !scene.practice;
 }
 
 // How far the node that is nearest to the tip is from where it was at first [m].
@@ -269,18 +328,18 @@ function report(steps, punctual, share) {
     came = shown = 0;
   }
   const now = performance.now(), late = ways.slice(-30).sort((a, b) => a - b);
-  const words = [`${Math.round(steps)} steps a second`, `${(100 * punctual).toFixed(1)} % on time`];
+  const words = [t("{0} steps a second", Math.round(steps)), t("{0} % on time", (100 * punctual).toFixed(1))];
   const wanted = Number($("speed").value);
-  if (share < 0.95 * wanted) words.push(`${share.toPrecision(2)} of real time`);
-  words.push(`${pictures.filter(t => now - t < 1000).length} pictures a second`);
-  if (late.length) words.push(`hand to picture ${Math.round(late[late.length >> 1])} ms`);
+  if (share < 0.95 * wanted) words.push(t("{0} of real time", share.toPrecision(2)));
+  words.push(t("{0} pictures a second", pictures.filter(at => now - at < 1000).length));
+  if (late.length) words.push(t("hand to picture {0} ms", Math.round(late[late.length >> 1])));
   $("loop").textContent = words.join(", ");
 }
 
 function targets() {
   if (!scene || !frame) return [];
-  const from = scene.head.length + 3 * scene.nodes + 12 * scene.geoms.length;
-  return Array.from({length: scene.targets}, (_, i) => [...frame.subarray(from + 8 * i, from + 8 * i + 8)]);
+  const from = frame.length - 19 * scene.sites.length;
+  return Array.from({length: scene.targets}, (_, i) => [...frame.subarray(from + 19 * i, from + 19 * i + 8)]);
 }
 
 function draw() {
@@ -288,24 +347,31 @@ function draw() {
   if (running) hand.say().forEach(say);
   if (!frame) return;
   const expert = trace && $("ghost").getAttribute("aria-pressed") === "true" ? trace : null, state = view.state();
+  const now = performance.now(), share = last?.length === frame.length ? Math.min((now - arrived) / Math.max(span, 1), 1) : 1;
   if (!fresh && !expert && state === drawn) return;
-  drawn = state;
-  view.draw(frame, head, expert);
+  drawn = share < 1 ? "" : state;  // until the picture is where the frame is
+  view.draw(share < 1 ? mix(share) : frame, head, expert);
   if (!fresh) return;
   fresh = false;
-  const now = performance.now();
   pictures.push(now);
   shown++;
   if (pictures.length > KEPT) pictures.shift();
   if (head.echo !== echoed) {
     echoed = head.echo;
-    ways.push((now - echoed + CLOCK) % CLOCK);
+    ways.push((now - echoed + CLOCK) % CLOCK + (1 - share) * span);
     if (ways.length > KEPT) ways.shift();
   }
   // One a picture: ten times a second is enough for curves.
   [() => plots.force.draw(scene.force_limit), () => plots.way.draw(undefined, 2, 0.5), () => plots.rate.draw(undefined, 0)][turn++ % 3]();
 }
 requestAnimationFrame(draw);
+
+// Returns numbers between the last two frames.
+function mix(share) {
+  if (mixed?.length !== frame.length) mixed = new Float32Array(frame.length);
+  for (let i = 0; i < frame.length; i++) mixed[i] = last[i] + share * (frame[i] - last[i]);
+  return mixed;
+}
 
 function beep(kind) {
   if (!$("sound").checked) return;
@@ -337,23 +403,31 @@ toggle("ghost", on => {
   if (!on) return;
   say({type: "ghost", known: Boolean(trace)});
   if (trace) trace.since = performance.now();
-  else tell("Computing the expert's path. The clock is stopped");
+  tell(t(trace ? "The clock is stopped; it goes on when you move" : "Computing the expert's path. The clock is stopped"));
+  waited = true;
 });
-for (const name of ["exercise", "practice"]) $(`tab-${name}`).onclick = () => mode(name);
+for (const name of MODES) $(`tab-${name}`).onclick = () => name === "tutorial" ? teach() : mode(name);
+$("begin").onclick = teach;
+$("language").value = language();
+$("language").onchange = () => {
+  speak($("language").value);
+  HEAR.menu(offer);
+  $("pause").textContent = t(paused ? "Resume" : "Pause");
+};
 $("start").onclick = start;
 $("task").onchange = hands;
 $("stop").onclick = () => say({type: "stop"});
 $("pause").onclick = () => {
   paused = !paused;
   say({type: "pause", on: paused});
-  $("pause").textContent = paused ? "Resume" : "Pause";
+  $("pause").textContent = t(paused ? "Resume" : "Pause");
   $("view").focus();
 };
 $("speed").onchange = () => running && say({type: "speed", value: Number($("speed").value)});
 $("device").onchange = () => say({type: "device", value: $("device").value});
 $("scheme").onchange = () => running && scene.practice && say({type: "scheme", value: $("scheme").value});
 // Another organ, mesh, ... is another scene.
-for (const name of ["organ", "mesh", "instrument", "step", "left"]) {
+for (const name of ["organ", "mesh", "instrument", "step", "left", "on"]) {
   $(name).onchange = () => running && scene.practice && start();
 }
 $("view").addEventListener("keydown", event => {

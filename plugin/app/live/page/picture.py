@@ -1,9 +1,11 @@
 # mujoco ships its bindings without type stubs:
 # pyright: reportAttributeAccessIssue=false
-"""What a page draws: the shapes of a scene once, and where they are thirty times a second."""
+"""What a page draws: the shapes of a scene once, and where they are sixty times a second."""
 
 from __future__ import annotations
 
+import base64
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -12,18 +14,26 @@ import mujoco as mj
 import numpy as np
 import trimesh
 from palpate import Organ
+from palpate.tissue.geometry import subdivide
+from scipy.sparse import csr_array, vstack
 
 from ..coupling import Link
 from ..realtime_clock import Pace
 
-# Numbers at the head of a frame, before the nodes, the geoms' places and the targets; `echo` is the
-# page's own clock when it sent the movement that is shown, `clock` the loop's [s].
+FPS = 60  # frames a second that free practice publishes, at most
+# Numbers at the head of a frame, before the nodes, the bodies' places and the sites; `echo` is the
+# page's own clock when it sent the movement that is shown, `clock` the loop's [s]; `current` is 1
+# while a hook sends one through what it touches.
 HEAD = (
   "time", "progress", "force", "shaft", "felt", "push", "missed", "steps", "state", "echo", "clock",
-  "tip_x", "tip_y", "tip_z", "tip_qw", "tip_qx", "tip_qy", "tip_qz",
+  "current", "tip_x", "tip_y", "tip_z", "tip_qw", "tip_qx", "tip_qy", "tip_qz",
 )  # fmt: skip
 STATES = ("waiting", "ready", "clutch", "lost", "paused")
 _SENSORS = ("tip_force", "shaft_force", "tip_pos", "tip_quat")
+HOOK = "hook/"  # prefix of the instrument that sends a current
+_SHOWN = 2  # the last group of geoms, sites and skins that is drawn
+_TINY = 2e-3  # weight below which a vertex does not count in a vertex of the skin
+_CHUNK = 250  # columns of the skin's matrix at a time
 
 
 class Camera:
@@ -46,15 +56,23 @@ class Camera:
       prefix: of the instrument in the right hand
       sites: of targets
     """
-    self.model, self._data, self._organ = model, data, organ
-    self._prefix, self._geoms, self._sites = prefix, _drawn(model), list(sites)
-    self._sensors = []
-    for name in _SENSORS:
-      sensor = model.sensor(prefix + name)
-      adr = int(sensor.adr[0])
-      self._sensors.append(data.sensordata[adr : adr + int(sensor.dim[0])])
-    self._rest, self.peak, self._begun = organ.xpos0, 0.0, 0.0
-    self._since = 0.0  # largest force since the last frame [N]
+    self.model, self._data, self._organ, self._prefix = model, data, organ, prefix
+    self._targets = len(sites)
+    others = np.flatnonzero(model.site_group <= _SHOWN)
+    self._sites = [*sites, *(int(site) for site in others if site not in sites)]
+    self._parts = _parts(model)
+    self._bodies = sorted({body for body, _ in self._parts})
+    self._hooks = [s for s in range(model.nsite) if model.site(s).name.endswith(f"{HOOK}tip")]
+    self._sensors = [self._sensor(prefix + name) for name in _SENSORS]
+    self._burnt = [self._sensor(f"{model.site(s).name}_force") for s in self._hooks]
+    self._whole, self.peak, self._begun = organ.elem, 0.0, 0.0
+    self._since = self._felt = None  # largest force since the last frame, and before [N]
+    self._follow()
+
+  def _sensor(self, name: str) -> np.ndarray:
+    sensor = self.model.sensor(name)
+    adr = int(sensor.adr[0])
+    return self._data.sensordata[adr : adr + int(sensor.dim[0])]
 
   @classmethod
   def of(cls, env: Any) -> Camera:
@@ -64,16 +82,37 @@ class Camera:
     return cls(*args, physics.target_sites)
 
   def shapes(self, **more: Any) -> dict[str, Any]:
-    """Returns what is drawn, JSON: organ, geoms, targets, camera, and what the caller adds."""
+    """Returns what is drawn, JSON: organ, parts, scenery, lights, and what the caller adds."""
     model, data = self.model, self._data
     eye = model.camera("laparoscope").id
+    used = self._used()
+    textures = {t: _texture(model, t) for t in sorted({_paper(model, m) for m in used}) if t >= 0}
+    hooks = [self._bodies.index(int(model.site_bodyid[s])) for s in self._hooks]
     return {
       "type": "scene",
       "nodes": self._organ.nvert,
-      "triangles": self._organ.elem.ravel().tolist(),
-      "organ": _organ_colour(model, self._organ.name),
-      "geoms": [_geom(model, g) | {"mine": self._mine(g)} for g in self._geoms],
-      "targets": len(self._sites),
+      "organ": self._surface(),
+      "parts": [
+        {
+          "body": self._bodies.index(body),
+          "mine": self._mine(body),
+          "shape": _shape(model, geoms),
+          "look": _look(model, *key),
+        }
+        for (body, key), geoms in self._parts.items()
+      ],
+      "bodies": len(self._bodies),
+      "scenery": [
+        _skin(model, data, s) for s in range(model.nskin)
+        if s != self._organ.skin and model.skin_group[s] <= _SHOWN
+      ],
+      "sites": [_FORMS.get(int(model.site_type[s]), "ball") for s in self._sites],
+      "targets": self._targets,
+      "hooks": [
+        [body, *model.site_pos[s].tolist()] for body, s in zip(hooks, self._hooks, strict=True)
+      ],
+      "textures": textures,
+      "lights": _lights(model, data),
       "camera": {
         "pos": data.cam_xpos[eye].tolist(),
         "mat": data.cam_xmat[eye].ravel().tolist(),
@@ -81,89 +120,288 @@ class Camera:
       },
       "head": HEAD,
       **more,
+    }  # fmt: skip
+
+  def _used(self) -> set[int]:
+    """Returns the materials of skins and of the organ."""
+    skins = self.model.skin_matid.tolist()
+    return {*skins, self._material()} - {-1}
+
+  def _material(self) -> int:
+    """Returns the organ's material, -1 for none."""
+    model, skin = self.model, self._organ.skin
+    if skin is not None:
+      return int(model.skin_matid[skin])
+    return int(np.ravel(model.flex_matid[self._flex()])[0])
+
+  def _flex(self) -> int:
+    return mj.mj_name2id(self.model, mj.mjtObj.mjOBJ_FLEX, self._organ.name)
+
+  def _surface(self) -> dict[str, Any]:
+    """Returns the organ: its look, its triangles, and the finer surface that is drawn for it."""
+    model, skin, flex = self.model, self._organ.skin, self._flex()
+    colour = model.skin_rgba[skin] if skin is not None else model.flex_rgba[flex]
+    walls = mj.mj_name2id(model, mj.mjtObj.mjOBJ_FLEX, f"{self._organ.name}_inside")
+    out = {
+      "look": _look(model, self._material(), tuple(colour)),
+      "inside": (model.flex_rgba[walls] if walls >= 0 else np.array([0.3, 0.05, 0.05])).tolist(),
+      "topology": self.topology(),
+    }
+    if skin is None or self._organ.elem is not self._whole:
+      return out
+    count = int(model.skin_vertnum[skin])
+    level = subdivide.LEVELS[subdivide.counts(self._whole).index(count)]
+    fine = subdivide.smooth(self._whole, level)
+    weight = _weights(self._whole.tobytes(), level)
+    rows = {name: pack(getattr(weight, name)) for name in ("indptr", "indices", "data")}
+    return out | {"smooth": rows | {"triangles": pack(fine.elem), "uv": self._uv()}}
+
+  def _uv(self) -> dict[str, str] | None:
+    """Returns where the vertices of what is drawn are on the organ's texture, None for none."""
+    model, skin, flex = self.model, self._organ.skin, self._flex()
+    if skin is not None:
+      adr = int(model.skin_texcoordadr[skin])
+      at = model.skin_texcoord[adr : adr + int(model.skin_vertnum[skin])]
+      return pack(at) if adr >= 0 else None
+    adr, first = int(model.flex_texcoordadr[flex]), int(model.flex_elemdataadr[flex])
+    if adr < 0:
+      return None
+    elem = self._organ.elem[: len(self._whole)]
+    corners = model.flex_elemtexcoord[first : first + elem.size]
+    out = np.zeros((self._organ.nvert, 2), np.float32)
+    out[elem.ravel()] = model.flex_texcoord[adr + corners]
+    return pack(out)
+
+  def _follow(self) -> None:
+    """Takes the organ's rest shape, which a cut changes."""
+    self._elem, self._rest = self._organ.elem, self._organ.xpos0
+
+  def cut(self) -> bool:
+    """Returns whether the organ was cut since it was looked at; see `topology`."""
+    return self._organ.elem is not self._elem
+
+  def topology(self) -> dict[str, Any]:
+    """Returns the triangles as they are now, JSON, where a cut has opened them, and places."""
+    self._follow()
+    solid = len(self._organ.tetrahedra) > 0
+    lips = np.zeros((0, 3)) if solid else _opened(self._whole, self._elem)
+    return {
+      "triangles": pack(self._elem),
+      "outer": len(self._whole),
+      "lips": pack(lips.astype(np.int32)),
+      "uv": self._uv(),
     }
 
-  def _mine(self, g: int) -> bool:
-    """Whether a geom goes where the tip goes: what hangs on the shaft's joint, not the port."""
-    model, body = self.model, int(self.model.geom_bodyid[g])
+  def _mine(self, body: int) -> bool:
+    """Whether a body goes where the tip goes: what hangs on the shaft's joint, not the port."""
+    model = self.model
     shaft = int(model.joint(f"{self._prefix}insertion").bodyid[0])
     while body and body != shaft:
       body = int(model.body_parentid[body])
     return body == shaft
 
   def feel(self, force: float) -> None:
-    """Takes the largest force of the tip in a control step, which lasts less long than a frame."""
-    self._since = max(self._since, force)
+    """Takes the largest force in a control step: that which warnings go by."""
+    self._since = self._felt = max(self._since or 0.0, force)
 
-  def frame(self, link: Link, pace: Pace, progress: float = 0.0) -> bytes:
-    """Returns a frame, float32: `HEAD`, nodes, geoms (place, matrix), targets (8 numbers each)."""
+  def frame(self, link: Link, pace: Pace, progress: float = 0.0, powered: bool = False) -> bytes:
+    """Returns a frame, float32: `HEAD`, nodes, bodies (place, matrix), sites.
+
+    A site has 19 numbers: place, colour, size, matrix.
+    """
     data, model, late = self._data, self.model, pace.lateness
     tip, shaft, pos, quat = self._sensors
-    force, self._since = max(float(np.linalg.norm(tip)), self._since), 0.0
+    felt = self._felt if self._since is None else self._since
+    force, self._since = float(np.linalg.norm(tip)) if felt is None else felt, None
     self.peak = max(self.peak, force)
     self._begun = self._begun or pace.now
-    state = "paused" if pace.paused or link.paused else link.state
-    felt = math.hypot(*link.force)
+    state = "paused" if pace.paused or link.paused else "waiting" if pace.waits else link.state
+    hand = math.hypot(*link.force)
+    current = powered and any(force.any() for force in self._burnt)
     head = (
-      data.time, progress, force, float(np.linalg.norm(shaft)), felt, self.peak, late.missed,
-      late.steps, STATES.index(state), link.device.stamp, pace.now - self._begun,
+      data.time, progress, force, float(np.linalg.norm(shaft)), hand, self.peak, late.missed,
+      late.steps, STATES.index(state), link.device.stamp, pace.now - self._begun, float(current),
       *pos, *quat,
     )  # fmt: skip
-    geoms, sites = self._geoms, self._sites
+    bodies, sites = self._bodies, self._sites
     parts = (
       head,
-      (self._rest + self._organ.displacement).ravel(),
-      np.hstack([data.geom_xpos[geoms], data.geom_xmat[geoms]]).ravel(),
-      np.hstack(
-        [data.site_xpos[sites], model.site_rgba[sites], model.site_size[sites, :1]]
-      ).ravel(),
-    )
+      (self._rest + self._organ.displacement[: len(self._rest)]).ravel(),
+      np.hstack([data.xpos[bodies], data.xmat[bodies]]).ravel(),
+      np.hstack([
+        data.site_xpos[sites], model.site_rgba[sites], model.site_size[sites], data.site_xmat[sites]
+      ]).ravel(),
+    )  # fmt: skip
     return np.concatenate(parts, dtype=np.float32, casting="unsafe").tobytes()
 
 
-def _organ_colour(model: mj.MjModel, name: str) -> list[float]:
-  flex = mj.mj_name2id(model, mj.mjtObj.mjOBJ_FLEX, name)
-  skin = int(model.flex_matid[flex])
-  colour = model.mat_rgba[skin] if skin >= 0 else model.flex_rgba[flex]
-  return [round(float(c), 3) for c in colour]
+def pack(values: np.ndarray) -> dict[str, str]:
+  """Returns numbers as JSON, base64: `f` are 32 bit floats, `b`, `h` and `u` 8, 16 and 32 bits."""
+  if values.dtype.kind == "f":
+    letter, kind = "f", np.float32
+  else:
+    most = int(values.max(initial=0)) if values.dtype != np.uint8 else 0
+    letter, kind = next(
+      (name, kind)
+      for name, kind in (("b", np.uint8), ("h", np.uint16), ("u", np.uint32))
+      if most <= np.iinfo(kind).max
+    )
+  return {letter: base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()}
 
 
-def _drawn(model: mj.MjModel) -> list[int]:
-  """Returns the geoms that are seen; the handle would hide the tip."""
-  handles = [model.body(b).name.endswith("handle") for b in range(model.nbody)]
-  shown = ~np.array(handles)[model.geom_bodyid]
-  shown &= (model.geom_group <= 2) & (_colours(model)[:, 3] > 0.05)
-  return [int(g) for g in np.flatnonzero(shown)]
+@functools.lru_cache(maxsize=4)
+def _weights(content: bytes, level: int) -> csr_array:
+  """Returns what an organ's vertices count in each of its skin's, without what is next to nothing.
+
+  The weights of a fine vertex add up to 1.
+  """
+  elem = np.frombuffer(content, np.int32).reshape(-1, 3)
+  fine, count = subdivide.smooth(elem, level), int(elem.max()) + 1
+  columns = []
+  for first in range(0, count, _CHUNK):
+    unit = np.eye(count, min(_CHUNK, count - first), -first)
+    weight = fine(unit).T
+    columns.append(csr_array(np.where(np.abs(weight) > _TINY, weight, 0.0)))
+  out = csr_array(vstack(columns).T)
+  out.data /= np.repeat(np.asarray(out.sum(axis=1)).ravel(), np.diff(out.indptr))
+  return out
 
 
-def _colours(model: mj.MjModel) -> np.ndarray:
-  colours, skin = model.geom_rgba.copy(), model.geom_matid
-  colours[skin >= 0] = model.mat_rgba[skin[skin >= 0]]
-  return colours
+def _opened(whole: np.ndarray, elem: np.ndarray) -> np.ndarray:
+  """Returns the edges that cuts have opened: start, end and opposite vertex  (n, 3)."""
+
+  def alone(t: np.ndarray) -> np.ndarray:
+    tail, head, n = t.ravel(), np.roll(t, -1, axis=1).ravel(), int(t.max()) + 1
+    return ~np.isin(head.astype(np.int64) * n + tail, tail.astype(np.int64) * n + head)
+
+  if elem is whole:
+    return np.zeros((0, 3), int)
+  half = np.flatnonzero(alone(elem) & ~alone(whole))
+  return np.stack([elem[half // 3, (half + k) % 3] for k in range(3)], axis=1)
 
 
-def _geom(model: mj.MjModel, g: int) -> dict[str, Any]:
-  """Returns a geom's triangles in its own frame [m]."""
+def _parts(model: mj.MjModel) -> dict[tuple[int, tuple], list[int]]:
+  """Returns the geoms that are seen, by body and look; the handle would hide the tip."""
+  found: dict[tuple[int, tuple], list[int]] = {}
+  for g in range(model.ngeom):
+    body, material = int(model.geom_bodyid[g]), int(model.geom_matid[g])
+    rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[g]
+    hidden = model.geom_group[g] > _SHOWN or rgba[3] <= 0.05
+    if hidden or model.body(body).name.endswith("handle"):
+      continue
+    if model.geom_type[g] in (mj.mjtGeom.mjGEOM_PLANE, mj.mjtGeom.mjGEOM_HFIELD):
+      continue
+    found.setdefault((body, (material, tuple(model.geom_rgba[g]))), []).append(g)
+  return found
+
+
+def _shape(model: mj.MjModel, geoms: Sequence[int]) -> dict[str, Any]:
+  """Returns the triangles of some geoms in the frame of their body [m]."""
+  vertices, triangles, count = [], [], 0
+  for g in geoms:
+    x, t = _geom(model, g)
+    turn = np.zeros(9)
+    mj.mju_quat2Mat(turn, model.geom_quat[g])
+    vertices.append(x @ turn.reshape(3, 3).T + model.geom_pos[g])
+    triangles.append(t + count)
+    count += len(x)
+  return {"vertices": pack(np.concatenate(vertices)), "triangles": pack(np.concatenate(triangles))}
+
+
+def _geom(model: mj.MjModel, g: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns a geom's vertices (n, 3) and triangles (m, 3) in its own frame [m]."""
   kind, size = model.geom_type[g], model.geom_size[g]
   make = trimesh.creation
   if kind == mj.mjtGeom.mjGEOM_MESH:
     k = model.geom_dataid[g]
     start, faces = model.mesh_vertadr[k], model.mesh_faceadr[k]
     vertices = model.mesh_vert[start : start + model.mesh_vertnum[k]]
-    triangles = model.mesh_face[faces : faces + model.mesh_facenum[k]]
+    return vertices, model.mesh_face[faces : faces + model.mesh_facenum[k]]
+  if kind == mj.mjtGeom.mjGEOM_CAPSULE:
+    shape = make.capsule(2 * size[1], size[0], count=[16, 16])
+  elif kind == mj.mjtGeom.mjGEOM_CYLINDER:
+    shape = make.cylinder(size[0], 2 * size[1], sections=24)
+  elif kind == mj.mjtGeom.mjGEOM_BOX:
+    shape = make.box(2 * size)
   else:
-    if kind == mj.mjtGeom.mjGEOM_CAPSULE:
-      shape = make.capsule(2 * size[1], size[0], count=[12, 12])
-    elif kind == mj.mjtGeom.mjGEOM_CYLINDER:
-      shape = make.cylinder(size[0], 2 * size[1], sections=16)
-    elif kind == mj.mjtGeom.mjGEOM_BOX:
-      shape = make.box(2 * size)
-    else:
-      shape = make.icosphere(2, 1.0)
-      shape.apply_scale(size if kind == mj.mjtGeom.mjGEOM_ELLIPSOID else size[0])
-    vertices, triangles = shape.vertices, shape.faces
+    shape = make.icosphere(3, 1.0)
+    shape.apply_scale(size if kind == mj.mjtGeom.mjGEOM_ELLIPSOID else size[0])
+  return np.asarray(shape.vertices), np.asarray(shape.faces)
+
+
+# What a site is drawn as, where that is no ball.
+_FORMS = {
+  int(mj.mjtGeom.mjGEOM_BOX): "box",
+  int(mj.mjtGeom.mjGEOM_CYLINDER): "cylinder",
+  int(mj.mjtGeom.mjGEOM_CAPSULE): "cylinder",
+  int(mj.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid",
+}
+
+
+def _paper(model: mj.MjModel, material: int) -> int:
+  """Returns the texture of a material, -1 for none that lies flat on a surface."""
+  if material < 0:
+    return -1
+  texture = int(model.mat_texid[material, mj.mjtTextureRole.mjTEXROLE_RGB])
+  flat = texture >= 0 and model.tex_type[texture] == mj.mjtTexture.mjTEXTURE_2D
+  return texture if flat else -1
+
+
+def _look(model: mj.MjModel, material: int, rgba: Sequence[float]) -> dict[str, Any]:
+  """Returns what a surface looks like: a material, where a colour of its own does not count."""
+  if material < 0:
+    return {"rgba": [round(float(c), 3) for c in rgba], "specular": 0.5, "shininess": 0.5}
   return {
-    "vertices": np.round(vertices, 6).ravel().tolist(),
-    "triangles": np.asarray(triangles).ravel().tolist(),
-    "rgba": [round(float(c), 3) for c in _colours(model)[g]],
+    "rgba": [round(float(c), 3) for c in model.mat_rgba[material]],
+    "specular": float(model.mat_specular[material]),
+    "shininess": float(model.mat_shininess[material]),
+    "texture": _paper(model, material),
+    "repeat": model.mat_texrepeat[material].tolist(),
   }
+
+
+def _texture(model: mj.MjModel, texture: int) -> dict[str, Any]:
+  height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
+  channels, adr = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
+  pixels = model.tex_data[adr : adr + height * width * channels].reshape(-1, channels)
+  rgb = pixels[:, :3] if channels > 2 else np.repeat(pixels[:, :1], 3, axis=1)
+  return {"width": width, "height": height, "pixels": pack(rgb)}
+
+
+def _skin(model: mj.MjModel, data: mj.MjData, skin: int) -> dict[str, Any]:
+  """Returns scenery where it lies; a skin's first bone carries all of it."""
+  first, count = int(model.skin_vertadr[skin]), int(model.skin_vertnum[skin])
+  face, faces = int(model.skin_faceadr[skin]), int(model.skin_facenum[skin])
+  bone = int(model.skin_boneadr[skin])
+  body, bind = int(model.skin_bonebodyid[bone]), np.zeros(9)
+  mj.mju_quat2Mat(bind, model.skin_bonebindquat[bone].astype(float))
+  own = (model.skin_vert[first : first + count] - model.skin_bonebindpos[bone]) @ bind.reshape(3, 3)
+  at = int(model.skin_texcoordadr[skin])
+  return {
+    "vertices": pack(own @ data.xmat[body].reshape(3, 3).T + data.xpos[body]),
+    "triangles": pack(model.skin_face[face : face + faces]),
+    "uv": pack(model.skin_texcoord[at : at + count]) if at >= 0 else None,
+    "look": _look(model, int(model.skin_matid[skin]), model.skin_rgba[skin]),
+  }
+
+
+def _lights(model: mj.MjModel, data: mj.MjData) -> list[dict[str, Any]]:
+  """Returns the lights; `around` is what all of them and the headlight give to every surface."""
+  head, every = model.vis.headlight, []
+  if head.active:
+    every.append({"pos": None, "colour": np.array(head.diffuse), "around": np.array(head.ambient)})
+  for k in range(model.nlight):
+    directed = model.light_type[k] == mj.mjtLightType.mjLIGHT_DIRECTIONAL
+    every.append({
+      "pos": data.light_xpos[k],
+      "dir": data.light_xdir[k],
+      "directed": bool(directed),
+      "cutoff": float(model.light_cutoff[k]),
+      "fade": model.light_attenuation[k],
+      "colour": model.light_diffuse[k],
+      "around": model.light_ambient[k],
+    })  # fmt: skip
+  return [
+    {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in light.items()}
+    for light in every
+  ]

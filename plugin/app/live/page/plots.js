@@ -36,8 +36,10 @@ export class Plot {
       points.forEach(([a, b]) => pen.lineTo(a, b));
       pen.stroke();
     };
-    if (limit) line("#e5484d", [[0, y(limit)], [width, y(limit)]]);
-    line("#4cd39b", values.map((value, i) => [width * i / SPAN, y(value)]));
+    pen.setLineDash([6, 4]);
+    if (limit) line("#e8833a", [[0, y(limit)], [width, y(limit)]]);
+    pen.setLineDash([]);
+    line("#7cc7f2", values.map((value, i) => [width * i / SPAN, y(value)]));
     pen.fillStyle = "#b4c0c6";
     pen.font = "12px system-ui, sans-serif";
     pen.fillText(short(most, digits), 4, 12);

@@ -23,13 +23,20 @@ from websockets.sync.server import ServerConnection, serve
 from ...trainee.keeping import Keeping
 from . import worker
 
-_KINDS = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
-_FILES = {"/": ("page.html", "text/html")} | {
-  f"/{name}": (name, _KINDS[name.rpartition(".")[2]])
-  for name in (
-    "page.js", "card.js", "hand.js", "plots.js", "view.js", "page.css", "icon.svg",
-  )
-}  # fmt: skip
+_HERE = pathlib.Path(__file__).parent
+_KINDS = {
+  ".html": "text/html; charset=utf-8",
+  ".js": "text/javascript; charset=utf-8",
+  ".css": "text/css; charset=utf-8",
+  ".svg": "image/svg+xml; charset=utf-8",
+  ".webp": "image/webp",
+}
+# What is served, and nothing else: the page's own files, three.js and the pictures of the cards.
+_FILES = {"/": _HERE / "page.html"} | {
+  f"/{path.relative_to(_HERE).as_posix()}": path
+  for path in (*_HERE.glob("*"), *_HERE.glob("three/*.js"), *_HERE.glob("cards/*"))
+  if path.suffix in _KINDS and path.name != "page.html"
+}
 _LARGEST = 4096  # message from a page [bytes]
 _PATIENCE = 10.0  # for a page's process to keep its recording [s]
 _POLICY = "default-src 'self'; connect-src 'self' {sockets}; frame-ancestors 'none'"
@@ -53,6 +60,7 @@ class Server:
     device: str = "mouse",
     most: int = 2,
     kept: Keeping | None = None,
+    scene: str = "",
   ):
     """Listens.
 
@@ -64,9 +72,10 @@ class Server:
       device: see `devices.device`
       most: pages at a time
       kept: the record that recordings go to, None for the folder
+      scene: MJCF file for free practice, empty for none
     """
     self.token = token or ("" if _own(host) else secrets.token_urlsafe(16))
-    self._folder, self._device, self._kept = folder, device, kept
+    self._folder, self._device, self._kept, self._scene = folder, device, kept, scene
     self._places = threading.BoundedSemaphore(most)
     self._open: set[ServerConnection] = set()
     self._server = serve(
@@ -109,9 +118,8 @@ class Server:
       return None
     if path not in _FILES:
       return _response(HTTPStatus.NOT_FOUND, "no such page")
-    name, kind = _FILES[path]
-    text = (pathlib.Path(__file__).parent / name).read_text(encoding="utf-8")
-    return _response(HTTPStatus.OK, text, kind, host)
+    file = _FILES[path]
+    return _response(HTTPStatus.OK, file.read_bytes(), _KINDS[file.suffix], host)
 
   def _page(self, socket: ServerConnection) -> None:
     """Connects a page with a process of its own, in a thread of its own."""
@@ -131,7 +139,9 @@ class Server:
     context = multiprocessing.get_context("spawn")
     near, far = context.Pipe()
     process = context.Process(
-      target=worker.main, args=(far, str(self._folder), self._device, self._kept), daemon=True
+      target=worker.main,
+      args=(far, str(self._folder), self._device, self._kept, self._scene),
+      daemon=True,
     )
     process.start()
     far.close()
@@ -160,11 +170,13 @@ def _pump(near: Any, socket: ServerConnection) -> None:
     socket.close()
 
 
-def _response(status: HTTPStatus, text: str, kind: str = "text/plain", host: str = "") -> Response:
-  body = text.encode()
+def _response(
+  status: HTTPStatus, content: str | bytes, kind: str = "text/plain; charset=utf-8", host: str = ""
+) -> Response:
+  body = content.encode() if isinstance(content, str) else content
   sockets = f"ws://{host} wss://{host}" if host else ""  # older browsers: 'self' is http alone
   headers = Headers({
-    "Content-Type": f"{kind}; charset=utf-8",
+    "Content-Type": kind,
     "Content-Length": str(len(body)),
     "Content-Security-Policy": _POLICY.format(sockets=sockets),
     "Referrer-Policy": "no-referrer",  # the address has the token

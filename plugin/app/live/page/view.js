@@ -1,55 +1,34 @@
-// Draws an exercise: the organ, whose nodes move, the instrument, the targets.
+// Draws a scene: tissue that moves, scenery that does not, instruments and marks. The server says where
+// things are; what a laparoscope adds to that, its lamp, wet surfaces and smoke, is made here.
+import * as THREE from "./three/three.module.min.js";
+import {unpack} from "./numbers.js";
 
-const VERTEX = `#version 300 es
-in vec3 place, normal;
-uniform mat4 clip, pose;
-out vec3 at, n;
-void main() {
-  vec4 world = pose * vec4(place, 1.0);
-  at = world.xyz;
-  n = mat3(pose) * normal;
-  gl_Position = clip * world;
-}`;
-// A light at the eye, as a laparoscope has it: Lambert and Blinn.
-const FRAGMENT = `#version 300 es
-precision highp float;
-in vec3 at, n;
-uniform vec3 eye;
-uniform vec4 colour;
-out vec4 pixel;
-void main() {
-  vec3 to = normalize(eye - at);
-  float cosine = abs(dot(normalize(n), to));
-  float far = clamp(0.16 / max(length(eye - at), 0.01), 0.35, 1.15);
-  pixel = vec4(colour.rgb * (0.16 + 0.84 * cosine) * far + 0.25 * pow(cosine, 40.0), colour.a);
-}`;
+const BODY = 12, SITE = 19;  // numbers of each in a frame
+const LIP = 8e-4;  // width of the edge of a cut [m]
+const EXPERT = 0x59f2bf;
+const PUFFS = 24;  // of smoke
+const NEAR = 0.005, FAR = 2;  // [m]
+// A scene's lights fade as MuJoCo's do, a + b d^2; `distance` and `decay` of a light carry a and b.
+THREE.ShaderChunk.lights_pars_begin = THREE.ShaderChunk.lights_pars_begin.replace(
+  /(float getDistanceAttenuation\([^{]*\{)[\s\S]*?\n}/,
+  "$1\n\treturn 1.0 / (cutoffDistance + decayExponent * lightDistance * lightDistance);\n}",
+);
 
 export class View {
-  constructor(canvas) {
+  // Throws where the browser has no WebGL 2. `wet` asks for the full picture from a processor too.
+  constructor(canvas, wet) {
     this.canvas = canvas;
-    this.slow = drawnByProcessor();
-    this.gl = canvas.getContext("webgl2", {antialias: !this.slow, alpha: false});
-    if (!this.gl) throw new Error("this browser draws no WebGL 2");
-    const gl = this.gl;
-    const program = gl.createProgram();
-    for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
-      const shader = gl.createShader(kind);
-      gl.shaderSource(shader, text);
-      gl.compileShader(shader);
-      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-      gl.attachShader(program, shader);
-    }
-    gl.linkProgram(program);
-    gl.useProgram(program);
-    this.at = name => gl.getUniformLocation(program, name);
-    this.place = gl.getAttribLocation(program, "place");
-    this.normal = gl.getAttribLocation(program, "normal");
-    gl.enable(gl.DEPTH_TEST);
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    this.slow = drawnByProcessor() && !wet;
+    this.patient = wet;  // however long a picture takes
+    this.gl = new THREE.WebGLRenderer({canvas, antialias: !this.slow, powerPreference: "high-performance"});
+    this.gl.toneMapping = THREE.NeutralToneMapping;
+    this.gl.toneMappingExposure = 1.15;
+    this.camera = new THREE.PerspectiveCamera(45, 1, NEAR, FAR);
+    this.camera.matrixAutoUpdate = false;
     this.wire = this.free = false;
+    this.wet = !this.slow;  // wet tissue and mirrors, or what is fast to draw
+    this.mirror = this.wet ? reflections(this.gl) : null;
     this.home();
-    this.ball = this.shape(...sphere(12));
   }
 
   // The free view where the laparoscope is.
@@ -61,50 +40,133 @@ export class View {
 
   // What the picture depends on beside the frame.
   state() {
-    const {canvas, wire, free, turn, shift, zoom} = this;
-    return JSON.stringify([canvas.clientWidth, canvas.clientHeight, wire, free, turn, shift, zoom]);
+    const {canvas, wire, free, turn, shift, zoom, smoke} = this;
+    const smoking = smoke?.some(puff => puff.visible) ? performance.now() : 0;
+    return JSON.stringify([canvas.clientWidth, canvas.clientHeight, wire, free, turn, shift, zoom, smoking]);
   }
 
   scale(factor) {
     this.zoom = Math.min(Math.max(this.zoom * factor, 0.2), 5);
   }
 
-  shape(places, triangles) {
-    const gl = this.gl, n = Float32Array.from(places), t = Uint32Array.from(triangles);
-    const edges = new Uint32Array(2 * t.length);
-    for (let i = 0; i < t.length; i += 3) {
-      edges.set([t[i], t[i + 1], t[i + 1], t[i + 2], t[i + 2], t[i]], 2 * i);
-    }
-    const made = {count: t.length, triangles: t, buffers: [0, 1, 2, 3].map(() => gl.createBuffer())};
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made.buffers[2]);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, t, gl.STATIC_DRAW);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made.buffers[3]);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, edges, gl.STATIC_DRAW);
-    this.put(made, n);
-    return made;
-  }
-
-  put(shape, places) {
-    const gl = this.gl;
-    gl.bindBuffer(gl.ARRAY_BUFFER, shape.buffers[0]);
-    gl.bufferData(gl.ARRAY_BUFFER, places, gl.DYNAMIC_DRAW);
-    gl.bindBuffer(gl.ARRAY_BUFFER, shape.buffers[1]);
-    gl.bufferData(gl.ARRAY_BUFFER, normals(places, shape.triangles), gl.DYNAMIC_DRAW);
-  }
-
-  // Draws with fewer pixels from now on, where the processor draws and is too slow at it.
+  // Draws with fewer pixels from now on, where drawing is too slow.
   hurry() {
-    if (this.slow) this.fine = Math.max(0.7 * this.fine, 0.5);
+    if (!this.patient) this.fine = Math.max(0.7 * this.fine, 0.5);
   }
 
   load(scene) {
-    this.fine = 1;  // pixels for one of the page
-    for (const old of this.scene ? [this.organ, ...this.geoms] : []) {
-      old.buffers.forEach(buffer => this.gl.deleteBuffer(buffer));
-    }
+    this.fine = this.slow ? 1 : Math.min(devicePixelRatio || 1, 2);  // pixels for one of the page
+    this.world?.traverse(each => {
+      each.geometry?.dispose();
+      each.material?.dispose();
+    });
+    this.papers?.forEach(paper => paper.dispose());
     this.scene = scene;
-    this.organ = this.shape(new Float32Array(3 * scene.nodes), scene.triangles);
-    this.geoms = scene.geoms.map(geom => this.shape(geom.vertices, geom.triangles));
+    this.world = new THREE.Scene();
+    this.world.background = new THREE.Color(0x120505);
+    this.papers = new Map(Object.entries(scene.textures).map(([key, value]) => [Number(key), paper(value)]));
+    scene.lights.forEach(light => this.world.add(...lamps(light)));
+    for (const each of scene.scenery) {
+      const mesh = new THREE.Mesh(shape(each), this.surface(each.look));
+      this.world.add(mesh);
+    }
+    this.parts = scene.parts.map(part => {
+      const mesh = new THREE.Mesh(creased(shape(part.shape)), this.surface(part.look, true));
+      mesh.matrixAutoUpdate = false;
+      mesh.userData = part;
+      return mesh;
+    });
+    this.marks = scene.sites.map(kind => {
+      const mesh = new THREE.Mesh(FORMS[kind], new THREE.MeshStandardMaterial({transparent: true, roughness: 0.4}));
+      mesh.matrixAutoUpdate = false;
+      mesh.userData = kind;
+      return mesh;
+    });
+    this.world.add(...this.parts, ...this.marks);
+    this.weave(scene.organ);
+    this.lead();
+    this.smoke = Array.from({length: PUFFS}, () => {
+      const puff = new THREE.Sprite(new THREE.SpriteMaterial({map: cloud(), transparent: true, depthWrite: false, color: 0xd8d4d0}));
+      puff.visible = false;
+      this.world.add(puff);
+      return puff;
+    });
+    this.puffed = this.blown = 0;
+  }
+
+  // The organ: what is drawn for it, its mesh, and what cuts have opened.
+  weave({look, inside, topology, smooth}) {
+    const material = this.surface(look, false, smooth ? THREE.FrontSide : THREE.DoubleSide);
+    this.inside = new THREE.Color().setRGB(...inside.slice(0, 3), THREE.SRGBColorSpace);
+    this.smooth = smooth && {
+      from: unpack(smooth.indptr), nodes: unpack(smooth.indices), share: unpack(smooth.data), count: unpack(smooth.indptr).length - 1,
+    };
+    this.organ = new THREE.Mesh(new THREE.BufferGeometry(), material);
+    this.organ.frustumCulled = false;
+    if (smooth) {
+      this.organ.geometry.setIndex(new THREE.BufferAttribute(unpack(smooth.triangles), 1));
+      put(this.organ.geometry, "position", 3 * this.smooth.count);
+      if (smooth.uv) this.organ.geometry.setAttribute("uv", new THREE.BufferAttribute(unpack(smooth.uv), 2));
+    }
+    this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshBasicMaterial({wireframe: true, color: 0xf0b8a0}));
+    this.walls = new THREE.Mesh(new THREE.BufferGeometry(), this.surface({rgba: [1, 1, 1, 1], specular: 0.7, shininess: 0.8}, false, THREE.DoubleSide));
+    this.walls.material.color.copy(this.inside);
+    this.mesh.frustumCulled = this.walls.frustumCulled = false;
+    this.world.add(this.organ, this.mesh, this.walls);
+    this.sew(topology);
+  }
+
+  // Takes the triangles of the organ; after a cut its own surface is drawn, for a skin knows of no cut.
+  sew({triangles, outer, lips, uv}) {
+    const elem = unpack(triangles);
+    this.lips = unpack(lips);
+    this.elem = elem.subarray(0, 3 * outer);
+    this.opened = elem.subarray(3 * outer);
+    const cut = this.lips.length > 0 || this.opened.length > 0;
+    if (cut) this.smooth = null;
+    this.mesh.geometry.setIndex(new THREE.BufferAttribute(this.elem, 1));
+    if (this.smooth) return;
+    if (this.organ.geometry.index) {
+      this.organ.geometry.dispose();
+      this.organ.geometry = new THREE.BufferGeometry();
+      this.organ.material.side = THREE.DoubleSide;
+      this.organ.material.needsUpdate = true;
+    }
+    this.organ.geometry.setIndex(new THREE.BufferAttribute(this.elem, 1));
+    if (uv) this.organ.geometry.setAttribute("uv", new THREE.BufferAttribute(unpack(uv), 2));
+    const n = this.lips.length / 3, quads = [];
+    for (let i = 0; i < n; i++) quads.push(4 * i, 4 * i + 1, 4 * i + 2, 4 * i, 4 * i + 2, 4 * i + 3);
+    this.walls.geometry.setIndex(n ? quads : new THREE.BufferAttribute(this.opened, 1));
+  }
+
+  // What shows the expert: the instrument, and its path.
+  lead() {
+    const material = new THREE.MeshBasicMaterial({color: EXPERT, transparent: true, opacity: 0.4});
+    this.ghosts = this.parts.filter(part => part.userData.mine).map(part => {
+      const ghost = new THREE.Mesh(part.geometry, material);
+      ghost.matrixAutoUpdate = ghost.visible = false;
+      ghost.userData = part;
+      this.world.add(ghost);
+      return ghost;
+    });
+    this.way = null;
+  }
+
+  // Returns how a surface is drawn, tissue or an instrument's.
+  surface({rgba, specular, shininess, texture, repeat}, hard = false, side = THREE.FrontSide) {
+    const color = new THREE.Color().setRGB(rgba[0], rgba[1], rgba[2], THREE.SRGBColorSpace);
+    const map = this.papers.get(texture) ?? null, metal = hard && specular > 0.85;
+    if (map && repeat) map.repeat.set(...repeat);
+    const common = {color, map, side, transparent: rgba[3] < 1, opacity: rgba[3]};
+    if (!this.wet) {
+      const shine = new THREE.Color(1, 1, 1).multiplyScalar(metal ? 0.9 : 0.35 * specular);
+      return new THREE.MeshPhongMaterial({...common, specular: shine, shininess: 20 + 60 * shininess});
+    }
+    const rough = {roughness: metal ? 0.3 : 0.5, metalness: metal ? 0.75 : 0};
+    const film = hard ? {clearcoat: metal ? 0 : 0.4, clearcoatRoughness: 0.3} : {
+      clearcoat: 0.35 + specular, clearcoatRoughness: 0.32 - 0.15 * shininess, bumpMap: map, bumpScale: 1.2,
+    };
+    return new THREE.MeshPhysicalMaterial({...common, ...rough, ...film, envMap: hard ? this.mirror : null, envMapIntensity: 1});
   }
 
   // The eye: place, and the axes right, up, back; turned and moved in a free view.
@@ -124,59 +186,104 @@ export class View {
     return {at, axes, fovy};
   }
 
+  // Draws a frame: its numbers, and those at its head by name.
   draw(frame, head, expert) {
-    const gl = this.gl, {canvas, scene} = this;
-    const fine = this.slow ? this.fine : Math.min(devicePixelRatio || 1, 2);
-    const width = Math.round(fine * canvas.clientWidth), height = Math.round(fine * canvas.clientHeight);
-    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    gl.viewport(0, 0, width, height);
-    gl.clearColor(0.07, 0.02, 0.02, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    const {scene, canvas, camera} = this, width = canvas.clientWidth, height = canvas.clientHeight;
+    this.gl.setPixelRatio(this.fine);
+    this.gl.setSize(width, height, false);
     const {at, axes, fovy} = this.eye([head.tip_x, head.tip_y, head.tip_z]);
-    gl.uniformMatrix4fv(this.at("clip"), false, clip(at, axes, fovy, width / height));
-    gl.uniform3fv(this.at("eye"), at);
-    let from = scene.head.length;
-    const places = from + 3 * scene.nodes;
-    this.put(this.organ, frame.subarray(from, from += 3 * scene.nodes));
-    this.paint(this.organ, UNIT, scene.organ, this.wire);
-    this.geoms.forEach((geom, i) => {
-      const p = frame.subarray(from, from += 12);
-      this.paint(geom, pose(p, p.subarray(3)), scene.geoms[i].rgba, false);
-    });
-    for (let i = 0; i < scene.targets; i++) {
-      const p = frame.subarray(from, from += 8);
-      if (p[6] > 0.05) this.paint(this.ball, ball(p), p.subarray(3, 7), false);
+    camera.fov = fovy;
+    camera.aspect = width / Math.max(height, 1);
+    camera.updateProjectionMatrix();
+    camera.matrix.makeBasis(...axes.map(axis => new THREE.Vector3(...axis))).setPosition(...at);
+    camera.matrixWorldNeedsUpdate = true;
+    const places = frame.length - BODY * scene.bodies - SITE * scene.sites.length, sites = places + BODY * scene.bodies;
+    this.drape(frame.subarray(scene.head.length, places));
+    for (const part of this.parts) {
+      pose(part.matrix, frame.subarray(places + BODY * part.userData.body));
+      part.matrixWorldNeedsUpdate = true;
     }
-    if (expert) this.show(expert, frame, places, head);
+    this.marks.forEach((mark, i) => place(mark, frame.subarray(sites + SITE * i, sites + SITE * (i + 1))));
+    this.show(expert, head);
+    this.fume(head.current > 0, frame, places);
+    this.gl.render(this.world, camera);
+  }
+
+  // Lays the surfaces over the organ's nodes.
+  drape(nodes) {
+    const {organ, mesh, walls, smooth, wire} = this;
+    organ.visible = !wire;
+    mesh.visible = wire;
+    if (wire) fill(mesh.geometry, nodes, null);
+    if (smooth) {
+      const out = organ.geometry.attributes.position.array, {from, nodes: near, share, count} = smooth;
+      for (let i = 0; i < count; i++) {
+        let x = 0, y = 0, z = 0;
+        for (let k = from[i]; k < from[i + 1]; k++) {
+          const j = 3 * near[k], s = share[k];
+          x += s * nodes[j];
+          y += s * nodes[j + 1];
+          z += s * nodes[j + 2];
+        }
+        out[3 * i] = x;
+        out[3 * i + 1] = y;
+        out[3 * i + 2] = z;
+      }
+      fill(organ.geometry, out, organ.geometry.index.array);
+    } else {
+      fill(organ.geometry, nodes, this.elem);
+    }
+    walls.visible = !wire && (this.lips.length > 0 || this.opened.length > 0);
+    if (!walls.visible) return;
+    if (this.lips.length) fill(walls.geometry, ribbons(this.lips, nodes), walls.geometry.index.array);
+    else fill(walls.geometry, nodes, this.opened);
   }
 
   // The expert's way, and the instrument where the expert has it now.
-  show({time, pose: poses, path, since}, frame, from, head) {
-    const now = (performance.now() - since) / 1e3 % (time.at(-1) + 1);
-    path.forEach(([x, y, z]) => this.paint(this.ball, ball([x, y, z, 0, 0, 0, 0, 0.0006]), WAY, false));
-    let k = time.findIndex(t => t >= now);
-    if (k < 0) k = time.length - 1;
-    const [x, y, z, ...quat] = poses[k];
-    const tip = inverse(rigid([head.tip_x, head.tip_y, head.tip_z], [head.tip_qw, head.tip_qx, head.tip_qy, head.tip_qz]));
-    const move = times(rigid([x, y, z], quat), tip);
-    this.scene.geoms.forEach((geom, i) => {
-      const p = frame.subarray(from + 12 * i, from + 12 * i + 12);
-      if (geom.mine) this.paint(this.geoms[i], times(move, pose(p, p.subarray(3))), GHOST, false);
-    });
+  show(expert, head) {
+    this.ghosts.forEach(ghost => ghost.visible = Boolean(expert));
+    if (this.way) this.way.visible = Boolean(expert);
+    if (!expert) return;
+    if (this.way?.userData !== expert) {
+      this.way?.removeFromParent();
+      this.way = new THREE.InstancedMesh(FORMS.ball, new THREE.MeshBasicMaterial({color: EXPERT}), expert.path.length);
+      expert.path.forEach((at, i) => this.way.setMatrixAt(i, new THREE.Matrix4().makeScale(6e-4, 6e-4, 6e-4).setPosition(...at)));
+      this.way.userData = expert;
+      this.way.frustumCulled = false;
+      this.world.add(this.way);
+    }
+    const now = (performance.now() - expert.since) / 1e3 % (expert.time.at(-1) + 1);
+    let k = expert.time.findIndex(t => t >= now);
+    if (k < 0) k = expert.time.length - 1;
+    const [x, y, z, ...quat] = expert.pose[k];
+    const tip = rigid([head.tip_x, head.tip_y, head.tip_z], [head.tip_qw, head.tip_qx, head.tip_qy, head.tip_qz]);
+    const move = rigid([x, y, z], quat).multiply(tip.invert());
+    for (const ghost of this.ghosts) {
+      ghost.matrix.multiplyMatrices(move, ghost.userData.matrix);
+      ghost.matrixWorldNeedsUpdate = true;
+    }
   }
 
-  paint(shape, matrix, colour, wire) {
-    const gl = this.gl;
-    gl.uniformMatrix4fv(this.at("pose"), false, matrix);
-    gl.uniform4fv(this.at("colour"), colour);
-    for (const [k, name] of [[0, this.place], [1, this.normal]]) {
-      gl.bindBuffer(gl.ARRAY_BUFFER, shape.buffers[k]);
-      gl.enableVertexAttribArray(name);
-      gl.vertexAttribPointer(name, 3, gl.FLOAT, false, 0, 0);
+  // Smoke rises from where a hook's current acts.
+  fume(burns, frame, places) {
+    const now = performance.now() / 1e3, {smoke, scene} = this;
+    if (burns && scene.hooks.length && now - this.blown > 0.06) {
+      const [body, ...at] = scene.hooks[0], puff = smoke[this.puffed++ % PUFFS];
+      const from = pose(new THREE.Matrix4(), frame.subarray(places + BODY * body));
+      puff.position.set(...at).applyMatrix4(from);
+      const away = () => 0.004 * (Math.random() - 0.5);
+      puff.userData = {born: now, speed: [away(), away(), 0.018 + away()], at: puff.position.clone()};
+      puff.visible = true;
+      this.blown = now;
     }
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, shape.buffers[wire ? 3 : 2]);
-    gl.drawElements(wire ? gl.LINES : gl.TRIANGLES, wire ? 2 * shape.count : shape.count,
-      gl.UNSIGNED_INT, 0);
+    for (const puff of smoke) {
+      if (!puff.visible) continue;
+      const {born, speed, at} = puff.userData, age = now - born;
+      puff.visible = age < 1.6;
+      puff.position.set(at.x + speed[0] * age, at.y + speed[1] * age, at.z + speed[2] * age);
+      puff.scale.setScalar(0.004 + 0.014 * age);
+      puff.material.opacity = 0.4 * Math.max(1 - age / 1.6, 0);
+    }
   }
 
   // How far a pixel is at the tip [m].
@@ -187,74 +294,189 @@ export class View {
   }
 }
 
-// Whether there is no graphics card to draw with: smooth edges would then cost every third picture.
+// Whether there is no graphics card to draw with: wet surfaces would then cost most pictures.
 function drawnByProcessor() {
   const gl = document.createElement("canvas").getContext("webgl2");
-  const about = gl?.getExtension("WEBGL_debug_renderer_info");
+  if (!gl) throw new Error("no WebGL 2");
+  const about = gl.getExtension("WEBGL_debug_renderer_info");
   const name = about ? gl.getParameter(about.UNMASKED_RENDERER_WEBGL) : "";
-  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
   return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
-const WAY = [0.35, 0.95, 0.75, 1], GHOST = [0.35, 0.95, 0.75, 0.4];
-const UNIT = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
 const add = (a, b) => a.map((x, i) => x + b[i]);
 const sub = (a, b) => a.map((x, i) => x - b[i]);
 const scale = (a, s) => a.map(x => x * s);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
-// Columns of a matrix in rows, as MuJoCo has it, and a place.
-const pose = (p, m) => [m[0], m[3], m[6], 0, m[1], m[4], m[7], 0, m[2], m[5], m[8], 0, p[0], p[1], p[2], 1];
-const ball = p => [p[7], 0, 0, 0, 0, p[7], 0, 0, 0, 0, p[7], 0, p[0], p[1], p[2], 1];
+// What marks are drawn as, of unit size.
+const FORMS = {ball: new THREE.SphereGeometry(1, 20, 14), box: new THREE.BoxGeometry(2, 2, 2)};
+FORMS.ellipsoid = FORMS.ball;
+FORMS.cylinder = new THREE.CylinderGeometry(1, 1, 2, 20).rotateX(Math.PI / 2);
 
-// Motions as matrices in columns.
-function rigid([x, y, z], [a, b, c, d]) {
-  return [1 - 2 * (c * c + d * d), 2 * (b * c + a * d), 2 * (b * d - a * c), 0,
-    2 * (b * c - a * d), 1 - 2 * (b * b + d * d), 2 * (c * d + a * b), 0,
-    2 * (b * d + a * c), 2 * (c * d - a * b), 1 - 2 * (b * b + c * c), 0, x, y, z, 1];
-}
-function times(a, b) {
-  return Array.from({length: 16}, (_, k) => [0, 1, 2, 3].reduce((sum, i) => sum + a[4 * i + k % 4] * b[4 * (k >> 2) + i], 0));
-}
-function inverse(m) {
-  const [x, y, z] = [m[12], m[13], m[14]];
-  return [m[0], m[4], m[8], 0, m[1], m[5], m[9], 0, m[2], m[6], m[10], 0,
-    -(m[0] * x + m[1] * y + m[2] * z), -(m[4] * x + m[5] * y + m[6] * z), -(m[8] * x + m[9] * y + m[10] * z), 1];
-}
+// A place and a matrix in rows, as MuJoCo has it.
+const pose = (out, [x, y, z, a, b, c, d, e, f, g, h, i]) => out.set(a, b, c, x, d, e, f, y, g, h, i, z, 0, 0, 0, 1);
 
-function clip(at, [r, u, b], fovy, aspect, near = 0.005, far = 2) {
-  const f = 1 / Math.tan(fovy * Math.PI / 360), [p, q] = [-dot(r, at), -dot(u, at)], s = -dot(b, at);
-  const [c, d] = [(far + near) / (near - far), 2 * far * near / (near - far)];
-  const x = f / aspect;
-  return [x * r[0], f * u[0], c * b[0], -b[0], x * r[1], f * u[1], c * b[1], -b[1],
-    x * r[2], f * u[2], c * b[2], -b[2], x * p, f * q, c * s + d, -s];
+// Puts a mark where its numbers say: place, colour, size, matrix.
+function place(mark, n) {
+  mark.visible = n[6] > 0.05;
+  if (!mark.visible) return;
+  pose(mark.matrix, [n[0], n[1], n[2], ...n.subarray(10, 19)]);
+  const [a, b, c] = n.subarray(7, 10), sizes = {ball: [a, a, a], cylinder: [a, a, b]};
+  mark.matrix.scale(new THREE.Vector3(...sizes[mark.userData] ?? [a, b, c]));
+  mark.matrixWorldNeedsUpdate = true;
+  mark.material.color.setRGB(n[3], n[4], n[5], THREE.SRGBColorSpace);
+  mark.material.emissive.copy(mark.material.color).multiplyScalar(0.35);
+  mark.material.opacity = n[6];
 }
 
-function normals(x, t) {
-  const out = new Float32Array(x.length);
-  for (let i = 0; i < t.length; i += 3) {
-    const [a, b, c] = [3 * t[i], 3 * t[i + 1], 3 * t[i + 2]];
-    const [u, v, w] = [x[b] - x[a], x[b + 1] - x[a + 1], x[b + 2] - x[a + 2]];
-    const [p, q, r] = [x[c] - x[a], x[c + 1] - x[a + 1], x[c + 2] - x[a + 2]];
-    const [l, m, n] = [v * r - w * q, w * p - u * r, u * q - v * p];
-    for (const k of [a, b, c]) {
-      out[k] += l;
-      out[k + 1] += m;
-      out[k + 2] += n;
+function rigid([x, y, z], [w, a, b, c]) {
+  return new THREE.Matrix4().makeRotationFromQuaternion(new THREE.Quaternion(a, b, c, w)).setPosition(x, y, z);
+}
+
+// Geometries. A vertex's numbers change in place.
+function put(geometry, name, length) {
+  const held = geometry.attributes[name];
+  if (held?.array.length === length) return held;
+  const made = new THREE.BufferAttribute(new Float32Array(length), 3);
+  made.setUsage(THREE.DynamicDrawUsage);
+  geometry.setAttribute(name, made);
+  return made;
+}
+function fill(geometry, places, triangles) {
+  const position = put(geometry, "position", places.length);
+  if (position.array !== places) position.array.set(places);
+  position.needsUpdate = true;
+  if (!triangles) return;
+  const normal = put(geometry, "normal", places.length);
+  normals(places, triangles, normal.array);
+  normal.needsUpdate = true;
+}
+function shape({vertices, triangles, uv}) {
+  const geometry = new THREE.BufferGeometry(), places = unpack(vertices), elem = unpack(triangles);
+  geometry.setIndex(new THREE.BufferAttribute(elem, 1));
+  fill(geometry, places, elem);
+  if (uv) geometry.setAttribute("uv", new THREE.BufferAttribute(unpack(uv), 2));
+  return geometry;
+}
+
+// The same with edges where faces meet at more than 35 degrees: hard things have some.
+function creased(geometry) {
+  const flat = geometry.toNonIndexed(), {array} = flat.attributes.position, n = array.length / 9, near = new Map();
+  const face = new Float32Array(3 * n);
+  for (let i = 0; i < n; i++) {
+    const [u, v] = [1, 2].map(k => [0, 1, 2].map(j => array[9 * i + 3 * k + j] - array[9 * i + j]));
+    const out = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+    const size = Math.hypot(...out) || 1;
+    for (let j = 0; j < 3; j++) face[3 * i + j] = out[j] / size;
+    for (let k = 0; k < 3; k++) {
+      const key = [0, 1, 2].map(j => Math.round(1e6 * array[9 * i + 3 * k + j])).join();
+      if (!near.has(key)) near.set(key, []);
+      near.get(key).push(i);
     }
+  }
+  const normal = new Float32Array(array.length);
+  for (let v = 0; v < 3 * n; v++) {
+    const i = Math.floor(v / 3), key = [0, 1, 2].map(j => Math.round(1e6 * array[3 * v + j])).join();
+    for (const k of near.get(key)) {
+      const same = face[3 * i] * face[3 * k] + face[3 * i + 1] * face[3 * k + 1] + face[3 * i + 2] * face[3 * k + 2];
+      if (same > 0.82) for (let j = 0; j < 3; j++) normal[3 * v + j] += face[3 * k + j];
+    }
+  }
+  flat.setAttribute("normal", new THREE.BufferAttribute(normal, 3));
+  flat.normalizeNormals();
+  return flat;
+}
+
+// Quads along opened edges: start, end, and both moved into their triangle.
+function ribbons(lips, x) {
+  const out = new Float32Array(4 * lips.length);
+  for (let i = 0; i < lips.length; i += 3) {
+    const [a, b, c] = [0, 1, 2].map(k => [0, 1, 2].map(j => x[3 * lips[i + k] + j]));
+    const along = sub(b, a), side = sub(c, a), inward = sub(side, scale(along, dot(side, along) / Math.max(dot(along, along), 1e-12)));
+    const step = scale(inward, LIP / Math.max(Math.hypot(...inward), 1e-9));
+    [a, b, add(b, step), add(a, step)].forEach((p, k) => out.set(p, 4 * i + 3 * k));
   }
   return out;
 }
 
-function sphere(n) {
-  const places = [], triangles = [];
-  for (let i = 0; i <= n; i++) {
-    for (let j = 0; j <= 2 * n; j++) {
-      const [a, b] = [Math.PI * i / n, Math.PI * j / n];
-      places.push(Math.sin(a) * Math.cos(b), Math.sin(a) * Math.sin(b), Math.cos(a));
-      const k = i * (2 * n + 1) + j;
-      if (i < n && j < 2 * n) triangles.push(k, k + 2 * n + 1, k + 1, k + 1, k + 2 * n + 1, k + 2 * n + 2);
+function normals(x, t, out) {
+  out.fill(0);
+  for (let i = 0; i < t.length; i += 3) {
+    const a = 3 * t[i], b = 3 * t[i + 1], c = 3 * t[i + 2];
+    const u0 = x[b] - x[a], u1 = x[b + 1] - x[a + 1], u2 = x[b + 2] - x[a + 2];
+    const v0 = x[c] - x[a], v1 = x[c + 1] - x[a + 1], v2 = x[c + 2] - x[a + 2];
+    const l = u1 * v2 - u2 * v1, m = u2 * v0 - u0 * v2, n = u0 * v1 - u1 * v0;
+    for (let k = 0; k < 3; k++) {
+      const at = 3 * t[i + k];
+      out[at] += l;
+      out[at + 1] += m;
+      out[at + 2] += n;
     }
   }
-  return [places, triangles];
+  for (let i = 0; i < out.length; i += 3) {
+    const size = Math.hypot(out[i], out[i + 1], out[i + 2]) || 1;
+    out[i] /= size;
+    out[i + 1] /= size;
+    out[i + 2] /= size;
+  }
+}
+
+// Pictures and lights.
+function paper({width, height, pixels}) {
+  const rgb = unpack(pixels), rgba = new Uint8Array(4 * width * height).fill(255);
+  for (let i = 0; i < width * height; i++) rgba.set(rgb.subarray(3 * i, 3 * i + 3), 4 * i);
+  const texture = new THREE.DataTexture(rgba, width, height);
+  texture.colorSpace = THREE.SRGBColorSpace;
+  texture.wrapS = texture.wrapT = THREE.RepeatWrapping;
+  texture.magFilter = THREE.LinearFilter;
+  texture.minFilter = THREE.LinearMipmapLinearFilter;
+  texture.generateMipmaps = true;
+  texture.anisotropy = 8;
+  texture.needsUpdate = true;
+  return texture;
+}
+
+function lamps({pos, dir, directed, cutoff, fade, colour, around}) {
+  const made = [], tone = rgb => new THREE.Color().setRGB(...rgb);
+  made.push(new THREE.AmbientLight(tone(around), 1.8));
+  if (!pos) return made;
+  let lamp;
+  if (directed) lamp = new THREE.DirectionalLight(tone(colour), 2.2);
+  else {
+    lamp = new THREE.SpotLight(tone(colour), 4, fade[0] + fade[1] * 0.15, Math.min(cutoff, 85) * Math.PI / 180, 0.9, fade[2]);
+  }
+  lamp.position.set(...pos);
+  lamp.target.position.set(...add(pos, dir));
+  made.push(lamp, lamp.target);
+  return made;
+}
+
+// What steel mirrors: a cavity of tissue, and the lamp.
+function reflections(gl) {
+  const room = new THREE.Scene(), maker = new THREE.PMREMGenerator(gl);
+  const box = (size, at, color) => {
+    const mesh = new THREE.Mesh(new THREE.BoxGeometry(...size), new THREE.MeshBasicMaterial({color, side: THREE.DoubleSide}));
+    mesh.position.set(...at);
+    room.add(mesh);
+  };
+  box([10, 10, 10], [0, 0, 0], new THREE.Color(0.22, 0.12, 0.1));
+  box([3, 3, 0.1], [1, 2, 4.5], new THREE.Color(9, 8.8, 8.4));
+  box([0.1, 2, 6], [-4.8, 1, 0], new THREE.Color(1.4, 1.3, 1.2));
+  const made = maker.fromScene(room, 0.03).texture;
+  maker.dispose();
+  return made;
+}
+
+let puff = null;
+function cloud() {
+  if (puff) return puff;
+  const size = 64, pixels = new Uint8Array(4 * size * size);
+  for (let i = 0; i < size * size; i++) {
+    const far = Math.hypot(i % size - size / 2, Math.floor(i / size) - size / 2) / (size / 2);
+    pixels.set([255, 255, 255, 255 * Math.max(1 - far, 0) ** 2], 4 * i);
+  }
+  puff = new THREE.DataTexture(pixels, size, size);
+  puff.needsUpdate = true;
+  return puff;
 }

@@ -27,10 +27,10 @@ from ..devices import registry
 from ..devices.device import Device, DeviceError
 from ..devices.relative import Desk
 from ..practice import DAMAGE, LIMIT, Practice
-from ..realtime_clock import Pace, first
+from ..realtime_clock import first
 from ..session import Session
 from . import ghost, menu
-from .picture import Camera
+from .picture import HOOK, Camera
 
 _STATUS = 0.1  # between words about the exercise [s]
 _WORDS = (
@@ -38,7 +38,9 @@ _WORDS = (
 )  # fmt: skip
 
 
-def main(conn: Connection, folder: str, device: str, kept: Keeping | None = None) -> None:
+def main(
+  conn: Connection, folder: str, device: str, kept: Keeping | None = None, scene: str = ""
+) -> None:
   """Serves one page until it says `end`.
 
   Args:
@@ -46,10 +48,11 @@ def main(conn: Connection, folder: str, device: str, kept: Keeping | None = None
     folder: where recordings are kept
     device: name of the device; one of the page's own is moved by its messages
     kept: the record that recordings go to, None for the folder
+    scene: MJCF file for free practice, empty for none
   """
   palpate.register()
   try:
-    Worker(conn, pathlib.Path(folder), device, kept).serve()
+    Worker(conn, pathlib.Path(folder), device, kept, scene).serve()
   except KeyboardInterrupt:
     pass
 
@@ -58,11 +61,16 @@ class Worker:
   """Runs the exercises that a page asks for, one after another."""
 
   def __init__(
-    self, conn: Connection, folder: pathlib.Path, device: str, kept: Keeping | None = None
+    self,
+    conn: Connection,
+    folder: pathlib.Path,
+    device: str,
+    kept: Keeping | None = None,
+    scene: str = "",
   ):
     """Takes the arguments of `main`."""
     self._sitting = (kept or Keeping(None)).begin(folder)
-    self._conn, self._own = conn, device
+    self._conn, self._own, self._scene = conn, device, scene
     self._device = "page" if registry.on_page(device) else device
     self._jobs: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
     self._now: Session | Practice | None = None  # what runs
@@ -74,13 +82,15 @@ class Worker:
     self._camera: Camera | None = None
     self._unkept: tuple[Recording, Kept, pathlib.Path | None] | None = None
     self._expert: subprocess.Popen | None = None
+    self._trace: dict[str, Any] | None = None  # of the expert; empty where it failed
+    self._asked = False  # for it
     self._ended = False
 
   def serve(self) -> None:
     """Works until the end."""
     for target in (self._receive, self._show):
       threading.Thread(target=target, daemon=True).start()
-    self._tell(menu.offer(self._own, self._sitting.keeping))
+    self._offer()
     while (job := self._jobs.get()) is not None:
       if not self._jobs.empty():  # something else was asked for since
         continue
@@ -105,6 +115,9 @@ class Worker:
     with self._lock:
       if not self._ended:
         self._conn.send_bytes(b"T" + json.dumps(message).encode())
+
+  def _offer(self) -> None:
+    self._tell(menu.offer(self._own, self._sitting.keeping, bool(self._scene)))
 
   def _fault(self, error: Exception | str) -> None:
     self._tell({"type": "error", "text": " ".join(str(error).split())})
@@ -139,12 +152,11 @@ class Worker:
     self._put(menu.exercise(message, self._own))
 
   def _on_practice(self, message: dict[str, Any]) -> None:
-    self._put(menu.practice(message, self._own))
+    self._put(menu.practice(message, self._own, bool(self._scene)))
 
   def _put(self, job: dict[str, Any]) -> None:
     self._stop()
-    if self._expert is not None:
-      self._expert.kill()
+    self._forget()
     self._jobs.put(job)
 
   def _on_scheme(self, message: dict[str, Any]) -> None:
@@ -166,9 +178,8 @@ class Worker:
     if not isinstance(session, Session) or self._job["assessment"]:
       raise ValueError("the expert is shown in exercises alone, and not in an assessment")
     session.coach.hint("the expert was shown")
-    if self._expert is None and message.get("known") is not True:
-      args = self._job, session.pace
-      threading.Thread(target=self._show_expert, args=args, daemon=True).start()
+    session.pace.waits = self._asked = True
+    self._show_expert()
 
   def _on_keep(self, message: dict[str, Any]) -> None:
     if self._unkept is not None:
@@ -194,8 +205,7 @@ class Worker:
   def _end(self) -> None:
     self._ended = True
     self._stop()
-    if self._expert is not None:
-      self._expert.kill()
+    self._forget()
     self._fresh.set()
     self._jobs.put(None)
 
@@ -228,20 +238,35 @@ class Worker:
       except OSError:
         self._end()
 
-  def _show_expert(self, job: dict[str, Any], pace: Pace) -> None:
-    """Has the expert's way worked out, in a thread of its own; the clock waits for it."""
-    waits, pace.paused = not pace.paused, True
-    self._expert = process = ghost.ask(job["task"], job["seed"], _kwargs(job))
+  def _foresee(self, job: dict[str, Any]) -> None:
+    """Has the expert's way worked out, so that it is known when it is asked for."""
+    self._trace, self._asked = None, False
+    if not job["assessment"]:
+      self._expert = ghost.ask(job["task"], job["seed"], _kwargs(job))
+      threading.Thread(target=self._learn, args=(job, self._expert), daemon=True).start()
+
+  def _learn(self, job: dict[str, Any], process: subprocess.Popen) -> None:
+    """Takes the expert's way when it is known, in a thread of its own."""
     text, _ = process.communicate()
-    pace.paused = pace.paused and not waits
-    if self._expert is process:
-      self._expert = None
-    if self._ended or job is not self._job:
+    if not self._ended and job is self._job and self._expert is process:
+      self._trace = {} if process.returncode else json.loads(text)
+      self._show_expert()
+
+  def _show_expert(self) -> None:
+    """Shows the expert's way, once it was asked for and is known."""
+    if not self._asked or self._trace is None:
       return
-    if process.returncode:
-      self._fault("the expert could not be shown")
+    self._asked = False
+    if self._trace:
+      self._tell({"type": "ghost", **self._trace})
     else:
-      self._tell({"type": "ghost", **json.loads(text)})
+      self._fault("the expert could not be shown")
+
+  def _forget(self) -> None:
+    """Ends what works out the expert's way."""
+    process, self._expert = self._expert, None
+    if process is not None:
+      process.kill()
 
   # Exercises.
 
@@ -258,14 +283,17 @@ class Worker:
         env, device, job["seed"], {"task_kwargs": kwargs, **info}, Options(scale=job["scale"]),
         coach=Coach(job["assessment"]), publish=self._draw, other=other, journal=path,
       )  # fmt: skip
+    session.pace.waits = True
+    self._foresee(job)
     recording = self._run(session, job, lambda: session.run(realtime=True, watch=self._feel))
+    self._forget()
     recording.info["person"] = job["person"]
     kept = self._keep(recording, None, path)
     shown = card(recording, self._sitting.references(job["task"]))
-    shown["advice"] += kept.said
+    shown["said"] += kept.said
     self._tell({"type": "card", "path": str(kept.path or ""), "fault": kept.fault, **shown})
     if self._sitting.keeping.trainee:  # another exercise may be open now
-      self._tell(menu.offer(self._own, self._sitting.keeping))
+      self._offer()
 
   def _run(self, made: Session | Practice, job: dict[str, Any], run: Any) -> Any:
     """Runs what was made, so that messages reach it."""
@@ -289,7 +317,15 @@ class Worker:
         assessment=self._job["assessment"], practice=False, step=env.physics.timestep(), **limits,
       ))  # fmt: skip
     camera, link, pace = self._camera, session.link, session.pace
-    self._publish(lambda: camera.frame(link, pace, env.task.progress))
+    self._follow(camera)
+    hands = zip(env.physics.hands, session.links, strict=True)
+    powered = any(each.grip for hand, each in hands if hand.prefix == HOOK)
+    self._publish(lambda: camera.frame(link, pace, env.task.progress, powered))
+
+  def _follow(self, camera: Camera) -> None:
+    """Tells of triangles that a cut has changed."""
+    if camera.cut():
+      self._tell({"type": "topology", **camera.topology()})
 
   def _feel(self, env: Any) -> None:
     """Takes the force of a control step, of which there are more than frames."""
@@ -298,7 +334,9 @@ class Worker:
 
   def _practise(self, job: dict[str, Any]) -> None:
     note = ", which takes a minute or more" if job["size"].get("grid", 0) > 100 else ""
-    self._tell({"type": "loading", "text": f"{job['organ']}, {job['mesh']}", "note": note})
+    scene = pathlib.Path(self._scene) if job["organ"] == menu.OWN else None
+    text = scene.name if scene else f"{job['organ']}, {job['mesh']}"
+    self._tell({"type": "loading", "text": text, "note": note})
     right, left = job["instrument"], job["left"]
     with self._hands(left) as (device, other):
       hands = {right: device}
@@ -306,7 +344,8 @@ class Worker:
         hands["grasper" if right != "grasper" else "probe"] = other
       practice = Practice(
         job["organ"], job["size"], hands, 1e-3 * job["step"], job["scheme"],
-        Options(scale=job["scale"]), self._picture,
+        Options(scale=job["scale"]), self._picture, on=job["on"] * (job["on"] != "cpu"),
+        scene=scene,
       )  # fmt: skip
     self._run(practice, job, lambda: practice.run(realtime=True))
     self._tell({"type": "idle", "late": practice.pace.lateness.summary()})
@@ -320,7 +359,8 @@ class Worker:
         force_limit=LIMIT, damage=DAMAGE, jaws=self._job["instrument"] != "probe", time_limit=None,
         report=False, assessment=False, practice=True, step=1e-3 * self._job["step"],
       ))  # fmt: skip
-    self._publish(lambda: camera.frame(practice.link, practice.pace))
+    self._follow(camera)
+    self._publish(lambda: camera.frame(practice.link, practice.pace, powered=practice.powered))
 
   @contextlib.contextmanager
   def _hands(self, left: str) -> Iterator[tuple[Device, Device | None]]:

@@ -1,0 +1,29 @@
+"""Draws the pictures of the home page: each exercise after its expert has worked for a second.
+
+python docs/draw_cards.py            # all
+python docs/draw_cards.py grasp cut  # those with one of these words in their name
+"""
+
+import pathlib
+import sys
+
+import imageio.v3 as imageio
+import mujoco
+from palpate import tasks
+from palpate.tasks.core import performer
+
+FOLDER = pathlib.Path(__file__).parents[1] / "plugin/app/live/page/cards"
+SIZE, SECONDS = (250, 400), 1.0
+
+for domain, task in tasks.ALL_TASKS:
+  name = f"{domain}_{task}"
+  if len(sys.argv) > 1 and not any(word in name for word in sys.argv[1:]):
+    continue
+  env = tasks.load(domain, task, task_kwargs={"random": 0})
+  timestep, act = env.reset(), performer.make(env)
+  while env.physics.time() < SECONDS and not timestep.last():
+    timestep = env.step(act(timestep))
+  with mujoco.Renderer(env.physics.model.ptr, *SIZE) as renderer:
+    renderer.update_scene(env.physics.data.ptr, "laparoscope")
+    imageio.imwrite(FOLDER / f"{name}.webp", renderer.render(), quality=75)
+  print(name, flush=True)

@@ -1,0 +1,93 @@
+"""Draws the states of the page of `palpate serve` in a browser, and a film's picture beside one.
+
+python docs/draw_page.py            # all
+python docs/draw_page.py home card  # some
+
+It needs Chromium and playwright, and says so where they are not there. Without a graphics card a
+state takes half a minute.
+"""
+
+import pathlib
+import shutil
+import sys
+import tempfile
+import threading
+
+import imageio.v3 as imageio
+
+FOLDER = pathlib.Path(__file__).with_name("pictures")
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+WIDE, PHONE = (1280, 800), (390, 844)
+# State -> size, what is clicked, keys that are held for so long [ms], and whether it is stopped.
+STATES = {
+  "home": (WIDE, None, {}, False),
+  "tutorial": (WIDE, "#tab-tutorial", {}, False),
+  "exercise": (WIDE, "[data-task='touch/easy']", {"d": 200}, False),
+  "warning": (WIDE, "[data-task='grasp/easy']", {"d": 2500}, False),
+  "two_hands": (WIDE, "[data-task='bimanual/easy']", {"d": 200}, False),
+  "card": (WIDE, "[data-task='touch/easy']", {"d": 300}, True),
+  "practice": (WIDE, "#tab-practice", {}, False),
+  "phone": (PHONE, "[data-task='trace/easy']", {"d": 200}, False),
+  "phone_home": (PHONE, None, {}, False),
+}
+ANSWER = 120e3  # [ms]
+
+
+def draw(browser, url: str, name: str) -> None:
+  """Writes the picture of a state."""
+  (width, height), start, keys, stopped = STATES[name]
+  phone = (width, height) == PHONE
+  page = browser.new_page(viewport={"width": width, "height": height}, has_touch=phone)
+  page.goto(f"{url}#look=wet")
+  page.wait_for_selector(".card", timeout=ANSWER)
+  if phone:
+    page.evaluate("document.body.classList.add('touch')")
+  if start:
+    page.click(start)
+    if name == "practice":
+      page.select_option("#organ", "gallbladder")
+      page.select_option("#instrument", "scalpel")
+      page.click("#start")
+    page.wait_for_selector("#stop:enabled", timeout=ANSWER)
+    page.wait_for_timeout(3000)
+  for key, held in keys.items():
+    page.focus("#view")
+    page.keyboard.down(key)
+    page.wait_for_timeout(held)
+    page.keyboard.up(key)
+    page.wait_for_timeout(2000)
+  if stopped:
+    page.dispatch_event("#stop", "click")
+    page.wait_for_selector("#card[open]", timeout=ANSWER)
+  page.wait_for_timeout(1500)
+  shot = imageio.imread(page.screenshot(timeout=ANSWER), extension=".png")[..., :3]
+  path = FOLDER / f"page_{name}.webp"
+  imageio.imwrite(path, shot, quality=80)
+  print(f"{path}: {path.stat().st_size // 1000} kB", flush=True)
+  page.close()
+
+
+def main() -> None:
+  """Draws the states that are named, or all."""
+  path = shutil.which("chromium") or shutil.which("google-chrome")
+  try:
+    from playwright.sync_api import sync_playwright
+  except ImportError:
+    path = None
+  if path is None:
+    print("no Chromium, or no playwright: nothing drawn")
+    return
+  from palpate.app.live.page.server import Server
+
+  with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
+    server = Server(pathlib.Path(folder), most=4)
+    threading.Thread(target=server.run, daemon=True).start()
+    browser = play.chromium.launch(executable_path=path, args=FLAGS)
+    for name in sys.argv[1:] or STATES:
+      draw(browser, server.url, name)
+    browser.close()
+    server.close()
+
+
+if __name__ == "__main__":
+  main()

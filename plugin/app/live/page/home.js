@@ -1,0 +1,64 @@
+// The home page: a card for each exercise, by domain, the easiest first.
+import {t} from "./texts.js";
+
+const KEY = "palpate.done";
+
+function make(tag, kind, text = "") {
+  const element = document.createElement(tag);
+  element.className = kind;
+  element.textContent = text;
+  return element;
+}
+
+// What was done in this browser, for those without a record: exercise -> "done" or "proficient".
+function known() {
+  try {
+    return JSON.parse(localStorage.getItem(KEY)) ?? {};
+  } catch {
+    return {};
+  }
+}
+export function note(task, {outcome, proficient}) {
+  if (outcome !== "success") return;
+  const all = known();
+  if (all[task] !== "proficient") all[task] = proficient ? "proficient" : "done";
+  try {
+    localStorage.setItem(KEY, JSON.stringify(all));
+  } catch { /* a browser that keeps nothing */ }
+}
+
+// Returns how far somebody is: exercise -> "proficient", "done", "open" or "locked", and the next one.
+export function standing({tasks, locked, progress}) {
+  const mine = progress ? Object.fromEntries(Object.entries(progress).map(([task, {met, good}]) => [task, met ? "proficient" : good ? "done" : ""])) : known();
+  const names = Object.keys(tasks), state = task => task in locked ? "locked" : mine[task] || "open";
+  const states = Object.fromEntries(names.map(task => [task, state(task)]));
+  return {states, next: names.find(task => states[task] === "open") ?? names.find(task => states[task] === "done")};
+}
+
+export function show(place, menu, start) {
+  const {states, next} = standing(menu), groups = new Map();
+  for (const task of Object.keys(menu.tasks)) {
+    const domain = task.split("/")[0];
+    if (!groups.has(domain)) groups.set(domain, []);
+    groups.get(domain).push(task);
+  }
+  place.replaceChildren(...[...groups].map(([domain, tasks]) => {
+    const row = make("div", "cards"), section = make("section", "domain");
+    row.append(...tasks.map(task => {
+      const card = make("button", `card ${states[task]}${task === next ? " next" : ""}`), picture = make("img", "");
+      const after = menu.locked[task], mark = {proficient: "★ ", done: "✓ ", locked: "🔒 ", open: ""}[states[task]];
+      const tried = menu.progress?.[task]?.tried ? t("{0} of {1} attempts proficient", menu.progress[task].good, menu.progress[task].tried) : "";
+      const status = after ? t("after {0}", after) : task === next ? `${mark}${t("next")}` : mark + t(states[task]);
+      picture.src = `cards/${task.replace("/", "_")}.webp`;
+      picture.alt = "";
+      picture.loading = "lazy";
+      card.dataset.task = task;
+      card.disabled = Boolean(after);
+      card.append(picture, make("strong", "", t(task.split("/")[1])), make("span", "what", menu.tasks[task]), make("span", "status", status), make("span", "tried", tried));
+      card.onclick = () => start(task);
+      return card;
+    }));
+    section.append(make("h2", "", t(domain)), row);
+    return section;
+  }));
+}

@@ -1,0 +1,132 @@
+// All words of the page. The English ones are the keys; `#` stands for a number. What the program says
+// (coach, metrics, exercises) is looked up here too, and stays English where it is not found.
+const GERMAN = {
+  // Places of the page.
+  "Home": "Start", "Exercises": "Übungen", "Tutorial": "Einführung", "Free practice": "Freies Üben", "your name": "dein Name",
+  "assessment": "Prüfung", "exercise": "Übung", "organ": "Organ", "mesh": "Netz", "scheme": "Verfahren", "instrument": "Instrument",
+  "More": "Mehr", "device of the hand": "Gerät der Hand", "device of the other hand": "Gerät der anderen Hand", "speed": "Tempo",
+  "scale of movements": "Maßstab der Bewegungen", "seed": "Startzahl", "time step": "Zeitschritt", "sound": "Ton", "computed on": "rechnet auf",
+  "language": "Sprache", "Start": "Start", "Pause": "Pause", "Resume": "Weiter", "Stop": "Ende", "Free view": "Freie Sicht", "Wireframe": "Netz",
+  "Show me": "Zeig es mir", "Deeper": "Tiefer", "Back": "Zurück", "Grip": "Greifen", "Here": "Hier", "Clutch": "Kuppeln", "roll left": "links drehen",
+  "roll right": "rechts drehen", "Force": "Kraft", "Force [N]": "Kraft [N]", "Progress": "Fortschritt", "Time": "Zeit",
+  "Displacement of the organ at the tip [mm]": "Verschiebung des Organs an der Spitze [mm]", "Speed of the simulation": "Tempo der Simulation",
+  "Steps a second": "Schritte je Sekunde", "How to move": "So wird bewegt", "what the laparoscope sees": "was das Laparoskop sieht",
+  "Mouse and touch: drag to move the tip across the picture. Use the wheel or two fingers for depth. Press Shift and drag to roll.":
+    "Maus und Finger: ziehen bewegt die Spitze im Bild. Rad oder zwei Finger für die Tiefe. Mit Umschalt ziehen dreht.",
+  "Keys: arrows or W A S D move across the picture, Q away and E towards you, Z and X roll. G closes the jaws, R reports, C is the clutch, P pauses, H shows the expert.":
+    "Tasten: Pfeile oder W A S D bewegen im Bild, Q weg und E heran, Z und X drehen. G schließt die Backen, R meldet, C kuppelt, P hält an, H zeigt die Könnerin.",
+  "Gamepad: the left stick moves across the picture, the right stick sets depth and roll. The first button grips, the second reports, the third is the clutch.":
+    "Gamepad: der linke Stick bewegt im Bild, der rechte stellt Tiefe und Drehung. Der erste Knopf greift, der zweite meldet, der dritte kuppelt.",
+  "Free view: drag to rotate the picture. Two fingers, or Shift and drag, pan it. The wheel or a pinch zooms. Keys and gamepad still move the instrument.":
+    "Freie Sicht: ziehen dreht das Bild. Zwei Finger, oder Umschalt und ziehen, schieben es. Rad oder Spreizen vergrößert. Tasten und Gamepad bewegen weiter das Instrument.",
+  // Home.
+  "Begin with the tutorial": "Beginne mit der Einführung", "It teaches how your hand moves the instrument, without clock and limits.":
+    "Sie zeigt, wie deine Hand das Instrument bewegt, ohne Uhr und Grenzen.",
+  "next": "als Nächstes", "done": "geschafft", "proficient": "sicher", "open": "offen", "after {0}": "nach {0}", "{0} of {1} attempts proficient": "{0} von {1} Versuchen sicher",
+  "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate_easy": "Tasten, leicht", "palpate_standard": "Tasten, mittel", "palpate_hard": "Tasten, schwer",
+  "touch": "Berühren", "probe": "Drücken und Tasten", "trace": "Nachfahren", "grasp": "Greifen", "retract": "Weghalten", "tease": "Ablösen",
+  "dissect": "Abpräparieren", "cut": "Schneiden", "bimanual": "Mit zwei Händen",
+  // What runs.
+  "Loading {0}": "Lädt {0}", "Loading {0}, which takes a minute or more": "Lädt {0}, das dauert eine Minute oder mehr",
+  "Choose an exercise and press Start.": "Wähle eine Übung und drücke Start.",
+  "Choose an organ and press Start. Every choice may be changed while it runs.": "Wähle ein Organ und drücke Start. Alles lässt sich ändern, während es läuft.",
+  "No connection to the program. Recordings are kept. Connecting again": "Keine Verbindung zum Programm. Aufnahmen sind gesichert. Verbindet neu",
+  "Assessment: no help": "Prüfung: keine Hilfe", "The clock starts with your first movement": "Die Uhr beginnt mit deiner ersten Bewegung",
+  "The clock is stopped; it goes on when you move": "Die Uhr steht; sie läuft weiter, wenn du dich bewegst",
+  "Computing the expert's path. The clock is stopped": "Der Weg der Könnerin wird berechnet. Die Uhr steht",
+  "waiting": "wartet", "clutch": "gekuppelt", "lost": "Gerät fehlt", "paused": "angehalten", "{0} N, limit {1} N": "{0} N, Grenze {1} N", "{0} of {1} s": "{0} von {1} s",
+  "real time": "Echtzeit", "{0} × real time": "{0} × Echtzeit", "default": "voreingestellt", "{0} nodes": "{0} Knoten", "none": "keines",
+  "mouse, touch, keys, gamepad": "Maus, Finger, Tasten, Gamepad", "keyboard, on this page": "Tasten dieser Seite", "gamepad, on this page": "Gamepad dieser Seite",
+  "{0} steps a second": "{0} Schritte je Sekunde", "{0} % on time": "{0} % pünktlich", "{0} of real time": "{0} der Echtzeit",
+  "{0} pictures a second": "{0} Bilder je Sekunde", "hand to picture {0} ms": "Hand bis Bild {0} ms",
+  "This browser draws no WebGL 2": "Dieser Browser zeichnet kein WebGL 2",
+  "Switch on its hardware acceleration, or try another browser. The exercise as a film, from the command line:":
+    "Schalte die Hardwarebeschleunigung ein oder nimm einen anderen Browser. Die Übung als Film, von der Befehlszeile:",
+  // Tutorial.
+  "Move the tip to the right": "Bewege die Spitze nach rechts", "Move it back to the left": "Bewege sie zurück nach links", "Move it up": "Bewege sie nach oben",
+  "Move it down": "Bewege sie nach unten", "Go deeper, away from you": "Geh tiefer, von dir weg", "Come back towards you": "Komm zurück, auf dich zu",
+  "Roll the instrument": "Drehe das Instrument", "Touch the organ gently and watch the force": "Berühre das Organ sanft und sieh auf die Kraft", "Let go of it": "Löse dich von ihm",
+  "Well done. Go on as you like, or press Stop and begin with the first exercise": "Gut gemacht. Mach weiter, wie du magst, oder drücke Ende und beginne die erste Übung",
+  "drag, or the arrow keys": "ziehen, oder die Pfeiltasten", "the wheel, two fingers, or Q": "Rad, zwei Finger oder Q", "the wheel, two fingers, or E": "Rad, zwei Finger oder E",
+  "Shift and drag, or Z and X": "Umschalt und ziehen, oder Z und X", "Step {0} of {1}": "Schritt {0} von {1}",
+  // The card.
+  "Done": "Geschafft", "Done, and proficient": "Geschafft, und sicher", "Not done": "Nicht geschafft", "What was good": "Was gut war", "What to do next": "Was als Nächstes zu tun ist",
+  "Try again": "Noch einmal", "Next: {0}": "Weiter: {0}", "Close": "Schließen", "Save again": "Noch einmal sichern", "Details": "Einzelheiten", "metric": "Größe", "yours": "du", "limit": "Grenze",
+  "unit": "Einheit", "count": "Anzahl", "Score {0}": "Wertung {0}", "Better than most skilled people: {0}": "Besser als die meisten Könner: {0}", "You reached the end": "Du hast das Ende erreicht",
+  "You kept within {0} of {1} limits": "Du hast {0} von {1} Grenzen eingehalten", "Nothing was measured: there was no movement": "Nichts wurde gemessen: es gab keine Bewegung",
+  "{0}: {1}, skilled people have at most {2}": "{0}: {1}, Könner haben höchstens {2}", "{0}: {1}, skilled people have at least {2}": "{0}: {1}, Könner haben mindestens {2}",
+  "Everything is within its limits: do it again to be proficient": "Alles ist in seinen Grenzen: mach es noch einmal, um sicher zu werden", "Try it again, slowly; Show me shows how": "Versuche es noch einmal, langsam; Zeig es mir zeigt, wie",
+  "Recording: {0}": "Aufnahme: {0}", "The recording is not in a file yet; it is kept while this page is open.": "Die Aufnahme ist noch in keiner Datei; sie bleibt, solange diese Seite offen ist.",
+  // What the program says.
+  "Success, after # s": "Geschafft, nach # s", "Failed: damage, after # s": "Verletzung, nach # s", "Out of time, after # s": "Die Zeit war um, nach # s",
+  "Stopped before the end, after # s": "Vor dem Ende beendet, nach # s",
+  "Touch the yellow point gently, # of #": "Berühre den gelben Punkt sanft, # von #", "Let go of the organ": "Löse dich vom Organ", "Go to the yellow site, # of #": "Geh zur gelben Stelle, # von #",
+  "Press more": "Drücke mehr", "Press less": "Drücke weniger", "Hold it there for # s more": "Halte so noch # s", "Touch the beginning of the line": "Berühre den Anfang der Linie",
+  "Touch the line where you have left it, and go on": "Berühre die Linie, wo du sie verlassen hast, und mach weiter", "Follow the line in light contact, # % done": "Folge der Linie mit leichtem Kontakt, # % geschafft",
+  "Open the jaws, go over the marked fold and close them gently": "Öffne die Backen, geh über die markierte Falte und schließe sie sanft", "Open the jaws to let go": "Öffne die Backen, um loszulassen",
+  "Lower it to where it was": "Senke es, wohin es gehört", "Lift it by # mm, towards the trocar": "Hebe es um # mm, zum Trokar hin", "Pull it aside: # of # % are seen": "Zieh es zur Seite: # von # % sind zu sehen",
+  "Pull less: the liver gives": "Zieh weniger: die Leber gibt nach", "Pull it further from its bed": "Zieh es weiter von seinem Bett", "Current off": "Strom aus",
+  "Hold it so, and divide its bed with the hook: # of # % are free": "Halte es so, und trenne sein Bett mit dem Haken: # von # % sind frei",
+  "Pull it off its bed: # of # % are free": "Zieh es von seinem Bett: # von # % sind frei", "Go under the flap and push gently along, side by side: # of # % are free": "Geh unter den Lappen und schiebe sanft, Seite an Seite: # von # % sind frei",
+  "Push the tip of the blade through the line": "Stich die Klinge durch die Linie", "Cut along the line: # % done": "Schneide an der Linie entlang: # % geschafft",
+  "Press here and there, and report where it is stiff while you press: # % of the field is felt": "Drücke hier und dort, und melde beim Drücken, wo es hart ist: # % des Felds sind getastet",
+  "Too much force: # N, expected at most # N": "Zu viel Kraft: # N, höchstens # N", "The shaft presses on the organ with # N": "Der Schaft drückt mit # N auf das Organ",
+  "You press on what is around with # N": "Du drückst mit # N auf die Umgebung", "The tip is out of the picture": "Die Spitze ist nicht im Bild",
+  "Peak force": "Größte Kraft", "Mean force in contact": "Mittlere Kraft im Kontakt", "Force-time product": "Kraft mal Zeit", "Force limit breaches": "Überschreitungen der Kraft",
+  "Excess impulse": "Impuls über der Grenze", "Peak force rate": "Größter Kraftanstieg", "Peak grip": "Größter Griff", "Mean grip": "Mittlerer Griff", "Grip limit breaches": "Überschreitungen des Griffs",
+  "Grip against pull": "Griff gegen Zug", "Shaft contact": "Kontakt des Schafts", "Peak force of the shaft": "Größte Kraft des Schafts", "Peak traction": "Größter Zug", "Peak tissue strain": "Größte Dehnung",
+  "Time to completion": "Zeit", "Path length": "Weglänge", "Mean speed": "Mittleres Tempo", "Peak speed": "Größtes Tempo", "Peak speed in contact": "Größtes Tempo im Kontakt", "Path inefficiency": "Umweg",
+  "Log dimensionless jerk": "Ruck (log)", "Angular path": "Drehweg", "Depth path": "Weg in die Tiefe", "Number of movements": "Zahl der Bewegungen", "Idle time": "Ruhezeit", "Idle share": "Anteil der Ruhe",
+  "Out of view": "Nicht im Bild", "Errors": "Fehler", "Grasp slips": "Abgerutscht", "Target error": "Abstand vom Ziel", "Share freed": "Befreiter Anteil", "Mean deviation": "Mittlere Abweichung",
+  "Largest deviation": "Größte Abweichung", "Excess tissue": "Gewebe zu viel", "Jagged length": "Gezackte Länge", "Depth of the blade": "Tiefe der Klinge", "Time of current": "Dauer des Stroms",
+  "Current without a target": "Strom ohne Ziel", "Tracing error (Frechet)": "Abweichung (Fréchet)", "Tracing error (RMS)": "Abweichung (RMS)", "RMS force in contact": "RMS-Kraft im Kontakt", "Peak contact pressure": "Größter Druck",
+  "approach slowly and stop at the first resistance": "nähere dich langsam und halte beim ersten Widerstand", "stay in light contact, less is enough": "bleib in leichtem Kontakt, weniger genügt",
+  "watch the force bar, and ease off before it turns red": "sieh auf den Kraftbalken und lass nach, bevor er warnt", "ease off at once when the force bar turns red": "lass sofort nach, wenn der Kraftbalken warnt",
+  "press and let go gradually": "drücke und löse allmählich", "close the jaws only until they hold": "schließe die Backen nur, bis sie halten",
+  "keep the shaft away from the organ; look at more than the tip": "halte den Schaft vom Organ fern; sieh auf mehr als die Spitze", "plan the next movement during the present one": "plane die nächste Bewegung während der jetzigen",
+  "go straight to the target": "geh gerade zum Ziel", "make one smooth movement in place of several corrections": "mach eine glatte Bewegung statt mehrerer Korrekturen", "turn the instrument less": "drehe das Instrument weniger",
+  "find the depth first, then go in once": "finde erst die Tiefe, dann geh einmal hinein", "make fewer, longer movements": "mach weniger, längere Bewegungen", "keep the tip in the picture": "halte die Spitze im Bild",
+  "touch only what is asked for": "berühre nur, was verlangt ist", "take more tissue between the jaws before you pull": "nimm mehr Gewebe zwischen die Backen, bevor du ziehst",
+  "look at the target from where the light shows its place, then touch": "sieh das Ziel an, wo das Licht seinen Ort zeigt, dann berühre es", "slow down in the bends of the line": "fahre langsamer in den Bögen der Linie",
+};
+const ENGLISH = {
+  "touch": "Touch", "probe": "Press and palpate", "trace": "Follow a line", "grasp": "Grasp and lift", "retract": "Hold aside", "tease": "Tease off",
+  "dissect": "Dissect", "cut": "Cut", "bimanual": "With two hands", "easy": "Easy", "standard": "Standard", "hard": "Hard", "depth": "Depth",
+  "palpate_easy": "Palpate, easy", "palpate_standard": "Palpate, standard", "palpate_hard": "Palpate, hard",
+};
+export const LANGUAGES = {en: ENGLISH, de: GERMAN};
+
+const stored = name => {
+  try {
+    return localStorage.getItem(name);
+  } catch {
+    return null;  // a browser that keeps nothing
+  }
+};
+let words = LANGUAGES[stored("palpate.language") ?? navigator.language.slice(0, 2)] ?? LANGUAGES.en;
+export const language = () => Object.keys(LANGUAGES).find(name => LANGUAGES[name] === words);
+
+// Returns a text in the page's language; {0}, {1} are the values.
+export function t(text, ...values) {
+  let found = words[text];
+  if (found === undefined) {
+    const numbers = text.match(NUMBER) ?? [];
+    found = words[text.replace(NUMBER, "#")]?.replace(/#/g, () => numbers.shift()) ?? text;
+  }
+  return found.replace(/\{(\d)\}/g, (_, i) => values[i]);
+}
+const NUMBER = /\d+(\.\d+)?/g;
+
+// Puts the page itself into a language: texts, titles and labels that are marked as such.
+export function speak(name = language()) {
+  words = LANGUAGES[name] ?? LANGUAGES.en;
+  document.documentElement.lang = language();
+  try {
+    localStorage.setItem("palpate.language", language());
+  } catch { /* kept for this page alone */ }
+  for (const element of document.querySelectorAll("[data-t]")) {
+    const key = element.dataset.t ||= element.textContent.trim().replace(/\s+/g, " ");
+    element.textContent = t(key);
+  }
+  for (const element of document.querySelectorAll("[data-label]")) element.setAttribute("aria-label", t(element.dataset.label));
+}
