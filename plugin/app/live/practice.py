@@ -28,10 +28,10 @@ KEY = "touch"
 SAFE = "implicit"  # scheme that holds at every step
 _SPARE = 8.0  # vertices for cuts, times the square root of the organ's
 _POWER = 30.0  # of a hook's current [W]
-# What cuts an organ, by instrument: as in docs/cutting.md.
+# What cuts an organ, by instrument, and the energy of a cut [J/m^2]: as in docs/cutting.md.
 _CUTTERS = {
-  "scalpel": "scalpel/edge",
-  "scissors": "scissors/edge_left scissors/edge_right",
+  "scalpel": "scalpel/edge 160",
+  "scissors": "scissors/edge_left scissors/edge_right 160",
   "hook": "hook/hook_toe 1.1e6 by hook/current",
 }
 _APART = 0.25  # from the way to the middle of an own scene's organ to each port, in its sizes

@@ -10,9 +10,13 @@ import threading
 import time
 import types
 
+import mujoco
 import numpy as np
 import palpate
 import pytest
+from palpate import models
+from palpate.app.live import practice
+from palpate.app.live.devices.hand import Hand
 from palpate.app.live.page.picture import HEAD, Camera
 from palpate.app.live.page.worker import Worker
 from palpate.app.live.realtime_clock import Pace
@@ -321,3 +325,24 @@ def unpack(packed):
   ((kind, text),) = packed.items()
   kinds = {"f": np.float32, "b": np.uint8, "h": np.uint16, "u": np.uint32}
   return np.frombuffer(base64.b64decode(text), kinds[kind])
+
+
+def test_cutting_tools_cut_in_free_practice():
+  spec, name = practice.furnished("gallbladder", {"nodes": 250}, ("scalpel",))
+  model = spec.compile()
+  organ = palpate.Organ(model, mujoco.MjData(model), name)
+  assert organ.config.spare and organ.cutters[0].geoms == ("scalpel/edge",)
+  assert organ.skin is not None  # in the abdomen
+
+
+def test_a_scene_of_ones_own_is_practised_on(tmp_path):
+  path = models.path("kidney", scene=False)
+  made = practice.Practice("", {}, {"hook": Hand()}, pace=Pace.instant(), scene=path)
+  away = np.linalg.norm(made.organ.xpos - made.data.site("hook/tip").xpos, axis=1).min()
+  assert 0.005 < away < 0.05  # of the tip
+  made.run(watch=lambda now: setattr(now.pace, "stopped", now.data.time > 0.02))
+  assert np.isfinite(made.organ.xpos).all() and made.data.time > 0.02
+  empty = tmp_path / "empty.xml"
+  empty.write_text("<mujoco><worldbody/></mujoco>")
+  with pytest.raises(ValueError, match="it has no organ"):
+    practice.own(empty, ())
