@@ -86,7 +86,7 @@ const GERMAN = {
   "keep the shaft away from the organ; look at more than the tip": "halte den Schaft vom Organ fern; sieh auf mehr als die Spitze", "plan the next movement during the present one": "plane die nächste Bewegung während der jetzigen",
   "go straight to the target": "geh gerade zum Ziel", "make one smooth movement in place of several corrections": "mach eine glatte Bewegung statt mehrerer Korrekturen", "turn the instrument less": "drehe das Instrument weniger",
   "find the depth first, then go in once": "finde erst die Tiefe, dann geh einmal hinein", "make fewer, longer movements": "mach weniger, längere Bewegungen", "keep the tip in the picture": "halte die Spitze im Bild",
-  "touch only what is asked for": "berühre nur, was verlangt ist", "take more tissue between the jaws before you pull": "nimm mehr Gewebe zwischen die Backen, bevor du ziehst",
+  "touch only what is asked for": "berühre nur, was verlangt ist", "go around what is not yours to touch": "umgehe, was nicht berührt werden soll", "take more tissue between the jaws before you pull": "nimm mehr Gewebe zwischen die Backen, bevor du ziehst",
   "look at the target from where the light shows its place, then touch": "sieh das Ziel an, wo das Licht seinen Ort zeigt, dann berühre es", "slow down in the bends of the line": "fahre langsamer in den Bögen der Linie",
 };
 const ENGLISH = {

@@ -287,6 +287,7 @@ class Worker:
     self._foresee(job)
     recording = self._run(session, job, lambda: session.run(realtime=True, watch=self._feel))
     self._forget()
+    self._tell(_status(session))  # what it ended with, which may have come within one picture
     recording.info["person"] = job["person"]
     kept = self._keep(recording, None, path)
     shown = card(recording, self._sitting.references(job["task"]))
