@@ -148,7 +148,8 @@ class Link:
     self._reference: tuple[Reading, list[float], Four, float] | None = None
     self._roll = 0.0
     self._next: Device | None = None
-    self._still: Reading | None = None  # of which a movement is told
+    # Of which a movement is told; what moves nothing but itself begins at its origin.
+    self._still = Reading(STILL) if device.relative else None
     self._last: Reading | None = None
     self.attach(None, STILL, _SAME, np.eye(3))
     self.quiet()
