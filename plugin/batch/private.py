@@ -1,5 +1,6 @@
 """What batches need of mujoco_warp's private modules, since its public ones lack it."""
 
+from mujoco_warp._src import passive, sensor, solver
 from mujoco_warp._src.collision_core import Geom
 from mujoco_warp._src.collision_gjk import ccd
 from mujoco_warp._src.collision_primitive_core import (
@@ -8,9 +9,11 @@ from mujoco_warp._src.collision_primitive_core import (
   sphere_triangle,
 )
 from mujoco_warp._src.constraint import _contact_kbimp as contact_kbimp
+from mujoco_warp._src.support import jac_dof
 from mujoco_warp._src.types import (
   MJ_MAX_EPAFACES,
   MJ_MAX_EPAHORIZON,
+  ConstraintType,
   ContactType,
   DeterminismType,
   GeomType,
@@ -19,7 +22,7 @@ from mujoco_warp._src.types import (
 )
 
 __all__ = [
-  "MJ_MAX_EPAFACES", "MJ_MAX_EPAHORIZON", "ContactType", "DeterminismType", "Geom", "GeomType",
-  "OverflowType", "box_triangle", "capsule_triangle", "ccd", "contact_kbimp", "sphere_triangle",
-  "vec5",
+  "MJ_MAX_EPAFACES", "MJ_MAX_EPAHORIZON", "ConstraintType", "ContactType", "DeterminismType",
+  "Geom", "GeomType", "OverflowType", "box_triangle", "capsule_triangle", "ccd", "contact_kbimp",
+  "jac_dof", "passive", "sensor", "solver", "sphere_triangle", "vec5",
 ]  # fmt: skip

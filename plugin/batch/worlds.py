@@ -7,6 +7,7 @@ along (`coupling/node.h`), and the nodes take over what contacts made of the slo
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import warnings
 from typing import Any
@@ -24,6 +25,7 @@ from . import host, kernels, states, strip_organs
 from .base import Batch, refuse_crowd, room_of
 from .camera import Camera
 from .contact import contacts, convex
+from .fixed_order import FixedOrder, is_enough
 from .organs import Organ
 from .private import DeterminismType, OverflowType
 from .reset import Rest
@@ -97,7 +99,7 @@ class Worlds(Batch):
       self._callbacks()
       try:
         self.record()
-      except RuntimeError as error:
+      except (RuntimeError, ValueError) as error:
         if not deterministic:
           raise
         raise ValueError(
@@ -122,6 +124,8 @@ class Worlds(Batch):
     )
     size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
     refuse_crowd(nworld, size, room_of(self.device), str(self.device))
+    if deterministic:  # which is what `fixed_order` knows
+      bare.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     try:
       own = ("dof_armature", "body_invweight0", "body_pos", "body_quat", "geom_friction")
       sizes: dict[str, int] = {name: nworld for name in own}
@@ -142,7 +146,10 @@ class Worlds(Batch):
     # All worlds wait for the one that takes longest.
     most = _CROWDED if self._crowded else _ITERATIONS
     self.m.opt.iterations = min(self.m.opt.iterations, most)
-    self.m.opt.deterministic = int(DeterminismType.ALL if deterministic else DeterminismType.NONE)
+    ordered = deterministic and is_enough(self.m, bare)
+    self._order = FixedOrder(self.m, self.d) if ordered else None
+    sorted_by_warp = deterministic and not ordered
+    self.m.opt.deterministic = int(DeterminismType.ALL if sorted_by_warp else DeterminismType.NONE)
     # The windows' triangles have no forces and contacts of mujoco_warp's own.
     self.m.nflexelem = self.m.nflexedge = 0
     gravity = np.tile(model.opt.gravity, (nworld, 1)).astype(np.float32)
@@ -185,6 +192,8 @@ class Worlds(Batch):
         organ.touch()
 
     def push(m, d):
+      if self._order:
+        self._order.sort()
       for organ in organs:
         organ.push()
 
@@ -202,7 +211,8 @@ class Worlds(Batch):
 
   def step_tools(self):
     """Launches mujoco_warp's step, with the windows' contacts."""
-    mjw.step(self.m, self.d)
+    with self._order.adding() if self._order else contextlib.nullcontext():
+      mjw.step(self.m, self.d)
 
   def end(self):
     """Launches the part after it."""

@@ -63,6 +63,7 @@ class Exercises(VectorEnv):
     render_mode: str | None = None,
     width: int = 640,
     height: int = 480,
+    deterministic: bool = False,
     **kwargs: Any,
   ):
     """Makes the environment.
@@ -79,6 +80,7 @@ class Exercises(VectorEnv):
       render_mode: None or `rgb_array`, see `render`
       width: of the pictures of `render` [pixels]
       height: of these [pixels]
+      deterministic: whether runs repeat to the bit on a GPU too, see `palpate.batch.make`
       **kwargs: of `Exercise`, such as `reward="sparse"`
 
     Raises:
@@ -108,7 +110,8 @@ class Exercises(VectorEnv):
       single.observation_space, single.action_space
     )  # fmt: skip
     devices = [device] if isinstance(device, str) else list(device)
-    self._make(single, task, kwargs, devices, limit, nodes)
+    options = {"nodes": self.task.slots if nodes is None else nodes}
+    self._make(single, task, kwargs, devices, limit, options | {"deterministic": deterministic})
     self.observation_space = batch_space(single.observation_space, self.num_envs)
     self.action_space = batch_space(single.action_space, self.num_envs)
     self.device, self.max_episode_steps = self.parts[0].device, limit
@@ -118,7 +121,7 @@ class Exercises(VectorEnv):
 
   def _make(
     self, single: Exercise, task: str, kwargs: dict[str, Any], devices: list[str], limit: int,
-    nodes: int | None,
+    options: dict[str, Any],
   ) -> None:  # fmt: skip
     """Makes the parts: each shape on each device has as many worlds as another."""
     kinds = list(itertools.product(devices, self.task.variants))
@@ -129,9 +132,8 @@ class Exercises(VectorEnv):
         of_part = single
         if len(kinds) > 1:
           of_part = Exercise(task, **{**kwargs, "variants": (variant,)})
-        options = {} if where == "cpu" else {"nodes": self.task.slots if nodes is None else nodes}
-        count = end - start
-        self.parts.append(Worlds(of_part.environment, count, where, limit, **options))
+        count, own = end - start, {} if where == "cpu" else options
+        self.parts.append(Worlds(of_part.environment, count, where, limit, **own))
         self.slices.append(slice(start, end))
 
   # Gymnasium's side.

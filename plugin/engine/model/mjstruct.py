@@ -157,7 +157,11 @@ def name_of(m: C.Structure, addresses: int | None, index: int) -> str:
 
 def check():
   """Raises ImportError for a MuJoCo out of range, or where the bindings' arrays are elsewhere."""
-  for text in importlib.metadata.requires("palpate") or ():
+  try:
+    needs = importlib.metadata.requires("palpate") or ()
+  except importlib.metadata.PackageNotFoundError:  # sources on the path, which are not installed
+    needs = ()
+  for text in needs:
     need = requirements.Requirement(text)
     if need.name == "mujoco" and not need.specifier.contains(mujoco.__version__, prereleases=True):
       raise ImportError(

@@ -1,0 +1,342 @@
+"""Steps of mujoco_warp that repeat to the bit, whatever the GPU does first.
+
+mujoco_warp's threads ask for constraint rows, which are placed as they come, and add up over rows
+by atomics. Here rows are put in an order that depends on the state alone, and the few sums over
+them are taken in it. Warp's own deterministic mode, which mujoco_warp has for all of its sums,
+writes down every addend of every kernel and sorts them all.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportReturnType=false
+# pyright: reportCallIssue=false, reportArgumentType=false, reportOperatorIssue=false
+# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false
+import contextlib
+import functools
+from collections.abc import Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.tissue.types import Array, fill, floats, ints, struct
+
+from . import private
+from .private import ConstraintType
+
+_INTS = ("type", "id", "J_rownnz", "J_rowadr")
+_FLOATS = ("pos", "margin", "D", "vel", "aref", "frictionloss")
+_CONTACT = wp.constant(int(ConstraintType.CONTACT_FRICTIONLESS))  # and what comes after it
+_FRICTION = wp.constant(int(ConstraintType.FRICTION_DOF))
+_PAIR = wp.constant(64)  # contacts of two geoms, at most
+_LANES = wp.constant(16)  # threads of a world that add up what rows do to dofs
+
+
+@struct
+class Rows:
+  """The constraint rows of mujoco_warp, and room to put them in order."""
+
+  ngeom: int
+  nefc: ints("nworld")
+  nblock: ints("nworld")  # blocks of rows that share their dofs
+  block_adr: ints("nworld", "njmax")  # their first row
+  block_nrow: ints("nworld", "njmax")
+  type: ints("nworld", "njmax")
+  id: ints("nworld", "njmax")  # of the joint, the contact, ...
+  J_rownnz: ints("nworld", "njmax")
+  J_rowadr: ints("nworld", "njmax")
+  pos: floats("nworld", "njmax")
+  margin: floats("nworld", "njmax")
+  D: floats("nworld", "njmax")
+  vel: floats("nworld", "njmax")
+  aref: floats("nworld", "njmax")
+  frictionloss: floats("nworld", "njmax")
+  frictionadr: ints("nworld", "nv")  # row of a dof's friction
+  contact_geom: Array(wp.vec2i, ("naconmax",))
+  contact_number: ints("naconmax")  # among those of two geoms
+  contact_row: ints("naconmax", "nrow")
+  key: Array(wp.int64, ("nworld", "njmax"))  # what rows are ordered by
+  part: ints("nworld", "njmax")  # which of its contact's rows
+  place: ints("nworld", "njmax")  # where a row goes
+  kept: ints(7, "nworld", "njmax")  # what is moved
+  kept_float: floats(6, "nworld", "njmax")
+
+
+@wp.func
+def _count(r: Rows, w: int):
+  return wp.min(r.nefc[w], r.type.shape[1])
+
+
+@wp.kernel(enable_backward=False)
+def _find_keys(r: Rows):
+  """Finds what rows are ordered by: the constraint, of a contact its geoms, or its place.
+
+  Contacts of an organ have places in a fixed order, see `contact.contacts`.
+  """
+  w, k = wp.tid()
+  if k >= _count(r, w):
+    return
+  key = wp.int64(r.id[w, k])
+  part = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  if r.type[w, k] >= _CONTACT:
+    c = r.id[w, k]
+    part = k - r.contact_row[c, 0]
+    pair = r.contact_geom[c]
+    if pair[0] >= 0 and pair[1] >= 0:
+      key = wp.int64(pair[0] * r.ngeom + pair[1]) * wp.int64(_PAIR) + wp.int64(r.contact_number[c])
+    else:
+      key += wp.int64(1) << wp.int64(44)
+  r.key[w, k] = key + (wp.int64(r.type[w, k]) << wp.int64(48))
+  r.part[w, k] = part
+
+
+@wp.kernel(enable_backward=False)
+def _keep(r: Rows):
+  """Finds where rows go, and keeps them."""
+  w, k = wp.tid()
+  n = _count(r, w)
+  if k >= n:
+    return
+  key = r.key[w, k]
+  to = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for q in range(n):
+    other = r.key[w, q]
+    if other < key or (other == key and q < k):
+      to += 1
+  r.place[w, k] = to
+  r.kept[0, w, to] = r.type[w, k]
+  r.kept[1, w, to] = r.id[w, k]
+  r.kept[2, w, to] = r.J_rownnz[w, k]
+  r.kept[3, w, to] = r.J_rowadr[w, k]
+  r.kept[4, w, to] = r.part[w, k]
+  r.kept_float[0, w, to] = r.pos[w, k]
+  r.kept_float[1, w, to] = r.margin[w, k]
+  r.kept_float[2, w, to] = r.D[w, k]
+  r.kept_float[3, w, to] = r.vel[w, k]
+  r.kept_float[4, w, to] = r.aref[w, k]
+  r.kept_float[5, w, to] = r.frictionloss[w, k]
+
+
+@wp.kernel(enable_backward=False)
+def _move(r: Rows):
+  """Moves rows to their places, and finds those of blocks."""
+  w, k = wp.tid()
+  if k < _count(r, w):
+    r.type[w, k] = r.kept[0, w, k]
+    r.id[w, k] = r.kept[1, w, k]
+    r.J_rownnz[w, k] = r.kept[2, w, k]
+    r.J_rowadr[w, k] = r.kept[3, w, k]
+    r.pos[w, k] = r.kept_float[0, w, k]
+    r.margin[w, k] = r.kept_float[1, w, k]
+    r.D[w, k] = r.kept_float[2, w, k]
+    r.vel[w, k] = r.kept_float[3, w, k]
+    r.aref[w, k] = r.kept_float[4, w, k]
+    r.frictionloss[w, k] = r.kept_float[5, w, k]
+    if r.kept[0, w, k] >= _CONTACT:
+      r.contact_row[r.kept[1, w, k], r.kept[4, w, k]] = k
+    elif r.kept[0, w, k] == _FRICTION:
+      r.frictionadr[w, r.kept[1, w, k]] = k
+  if k < r.nblock[w]:
+    adr = r.place[w, r.block_adr[w, k]]
+    to = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    for q in range(r.nblock[w]):
+      to += wp.where(r.place[w, r.block_adr[w, q]] < adr, 1, 0)
+    r.kept[5, w, to] = adr
+    r.kept[6, w, to] = r.block_nrow[w, k]
+
+
+@wp.kernel(enable_backward=False)
+def _move_blocks(r: Rows):
+  """Moves blocks to their places."""
+  w, k = wp.tid()
+  if k < r.nblock[w]:
+    r.block_adr[w, k] = r.kept[5, w, k]
+    r.block_nrow[w, k] = r.kept[6, w, k]
+
+
+# In place of kernels of mujoco_warp's, with their arguments.
+
+
+@functools.cache
+def _gradient(stable_fast: bool, deterministic: bool) -> wp.Kernel:
+  """Returns the kernel of the gradient, one thread adding up its square."""
+
+  @wp.kernel(module="unique", enable_backward=False)
+  def gradient(
+    smooth: wp.array2d[float], constraint: wp.array2d[float], Ma: wp.array2d[float],
+    changed: wp.array[int], done: wp.array[bool],
+    out: wp.array2d[float], square: wp.array[float],
+  ):  # fmt: skip
+    w, i = wp.tid()
+    if done[w]:
+      return
+    out[w, i] = Ma[w, i] - smooth[w, i] - constraint[w, i]
+    if i == 0:
+      total = float(0.0)  # noqa: UP018 - a variable to Warp
+      for k in range(Ma.shape[1]):
+        g = Ma[w, k] - smooth[w, k] - constraint[w, k]
+        total += g * g
+      square[w] = total
+
+  return gradient
+
+
+@functools.cache
+def _constraint_force(compact: bool, nv: int, deterministic: bool) -> wp.Kernel:
+  """Returns the kernel of J^T f: a thread has every 16th dof, and goes over the rows in order."""
+
+  @wp.kernel(module="unique", enable_backward=False)
+  def constraint_force(
+    nefc: wp.array[int], rownnz: wp.array2d[int], rowadr: wp.array2d[int],
+    colind: wp.array3d[int], J: wp.array3d[float], force: wp.array2d[float],
+    cdof: wp.array2d[int], changed: wp.array[int], done: wp.array[bool], out: wp.array2d[float],
+  ):  # fmt: skip
+    w, lane = wp.tid()
+    lanes = wp.min(_LANES, force.shape[1])
+    if lane >= lanes or done[w] or changed[w] == 0:
+      return
+    for k in range(wp.min(nefc[w], force.shape[1])):
+      f = force[w, k]
+      if f != 0.0:
+        for q in range(rowadr[w, k], rowadr[w, k] + rownnz[w, k]):
+          i = colind[w, 0, q]
+          if i % lanes == lane:
+            out[w, i] = out[w, i] + J[w, 0, q] * f
+
+  return constraint_force
+
+
+@functools.cache
+def _compensation(deterministic: bool) -> wp.Kernel:
+  """Returns the kernel of what bears bodies against gravity, a thread a dof."""
+
+  @wp.kernel(module="unique", enable_backward=False)
+  def compensation(
+    gravity: wp.array[wp.vec3], parentid: wp.array[int], rootid: wp.array[int],
+    mass: wp.array2d[float], share: wp.array2d[float], dof_bodyid: wp.array[int],
+    isdofancestor: wp.array2d[int], xipos: wp.array2d[wp.vec3], com: wp.array2d[wp.vec3],
+    cdof: wp.array2d[wp.spatial_vector], out: wp.array2d[float],
+  ):  # fmt: skip
+    w, thread, i = wp.tid()
+    if thread > 0:
+      return
+    total = float(0.0)  # noqa: UP018 - a variable to Warp
+    for b in range(1, share.shape[1]):
+      borne = share[w % share.shape[0], b] * mass[w % mass.shape[0], b]
+      if borne != 0.0 and isdofancestor[b, i] != 0:
+        jac, _turn = private.jac_dof(
+          parentid, rootid, dof_bodyid, isdofancestor, com, cdof, xipos[w, b], b, i, w
+        )
+        total -= borne * wp.dot(jac, gravity[w % gravity.shape[0]])
+    out[w, i] = total
+
+  return compensation
+
+
+@functools.cache
+def _sort_matches(most: int) -> wp.Kernel:
+  """Returns the kernel that orders a sensor's contacts: by its criterion, then by their places."""
+
+  @wp.func
+  def before(a: int, b: int, of_a: float, of_b: float):
+    if of_a != of_b:
+      return of_a < of_b
+    return wp.max(a, ~a) < wp.max(b, ~b)  # ~ where the sensor's body is the second
+
+  @wp.kernel(module="unique", enable_backward=False)
+  def sort_matches(
+    intprm: wp.array2d[int], sensor: wp.array[int], count: wp.array2d[int],
+    match: wp.array3d[int], criterion: wp.array3d[float], out: wp.array3d[int],
+  ):  # fmt: skip
+    w, s, lane = wp.tid()
+    if lane > 0:
+      return
+    for k in range(1, wp.min(count[w, s], wp.static(most))):
+      at, mine, own = k, match[w, s, k], criterion[w, s, k]
+      while at > 0 and before(mine, match[w, s, wp.max(at - 1, 0)],
+                              own, criterion[w, s, wp.max(at - 1, 0)]):  # fmt: skip
+        match[w, s, at] = match[w, s, at - 1]
+        criterion[w, s, at] = criterion[w, s, at - 1]
+        at -= 1
+      match[w, s, at] = mine
+      criterion[w, s, at] = own
+
+  return sort_matches
+
+
+def is_enough(m: Any, model: mujoco.MjModel) -> bool:
+  """Returns whether what is here is all of a scene that depends on who comes first.
+
+  Sums of two addends do not; else Warp's deterministic mode is to be asked.
+  """
+  driven = np.zeros(model.nv, int)
+  for kind, number in zip(model.actuator_trntype, model.actuator_trnid[:, 0], strict=True):
+    if kind == mujoco.mjtTrn.mjTRN_JOINT:
+      driven[model.jnt_dofadr[number]] += 1
+    elif kind == mujoco.mjtTrn.mjTRN_TENDON:
+      start = model.tendon_adr[number]
+      wraps = model.wrap_objid[start : start + model.tendon_num[number]]
+      driven[model.jnt_dofadr[wraps]] += 1
+    else:
+      return False
+  fixed = (model.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT).all()
+  return bool(
+    m.is_sparse
+    and model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+    and model.opt.integrator in (mujoco.mjtIntegrator.mjINT_EULER,
+                                 mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    and not (m.has_fluid or m.sensor_rne_postconstraint)
+    and fixed
+    and (model.tendon_num <= 2).all()
+    and (driven <= 2).all()
+  )  # fmt: skip
+
+
+class FixedOrder:
+  """Puts the rows of mujoco_warp's constraints in order, and lets its step add them up in that."""
+
+  def __init__(self, m: Any, d: Any):
+    """Makes room for rows on their way."""
+    efc, contact, shape = d.efc, d.contact, (d.nworld, d.njmax)
+    values = {name: getattr(efc, name) for name in (*_INTS, *_FLOATS)} | dict(
+      ngeom=m.ngeom,
+      nefc=d.nefc,
+      nblock=efc.jtdaj_nblock,
+      block_adr=efc.jtdaj_adr,
+      block_nrow=efc.jtdaj_nrow,
+      frictionadr=d.dof_frictionadr,
+      contact_geom=contact.geom,
+      contact_number=contact.geomcollisionid,
+      contact_row=contact.efc_address,
+    )
+    values |= {"key": np.zeros(shape, np.int64), "kept": np.zeros((7, *shape))}
+    values |= {name: np.zeros(shape) for name in ("part", "place")}
+    self._rows = fill(Rows, d.qpos.device, values | {"kept_float": np.zeros((6, *shape))})
+    self._shape = shape
+
+  def sort(self) -> None:
+    """Launches what puts the rows in order, once they are made and before they are used."""
+    for kernel in (_find_keys, _keep, _move, _move_blocks):
+      wp.launch(kernel, dim=self._shape, inputs=[self._rows], device=self._rows.nefc.device)
+
+  @staticmethod
+  @contextlib.contextmanager
+  def adding() -> Iterator[None]:
+    """Lets what mujoco_warp launches within add up in order."""
+    solver, sensor = private.solver, private.sensor
+    instead: dict[tuple[Any, str], Any] = {
+      (solver, "_jtdaj_groups_per_world"): lambda *sizes: 1,  # who adds blocks up
+      (solver, "_use_incremental"): lambda m: False,
+      (solver, "_update_gradient_grad"): _gradient,
+      (solver, "_update_constraint_init_qfrc_constraint_sparse"): _constraint_force,
+      (private.passive, "_gravity_force"): _compensation,
+      (sensor, "_contact_sort"): _sort_matches,
+      (sensor, "_sensor_touch"): lambda deterministic: kept[sensor, "_sensor_touch"](True),
+    }
+    kept = {(module, name): getattr(module, name) for module, name in instead}
+    try:
+      for (module, name), other in instead.items():
+        setattr(module, name, other)
+      yield
+    finally:
+      for (module, name), own in kept.items():
+        setattr(module, name, own)

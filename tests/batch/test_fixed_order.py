@@ -1,0 +1,96 @@
+"""Batches that repeat to the bit: rows of constraints are in an order of their own."""
+
+import mujoco
+import numpy as np
+import palpate.batch
+import pytest
+from devices import needs_cuda
+from palpate.batch.fixed_order import FixedOrder, is_enough
+from scenes import probed
+
+ROWS = ("type", "id", "J_rownnz", "J_rowadr", "pos", "margin", "D", "vel", "aref", "frictionloss")
+BLOCKS = ("jtdaj_adr", "jtdaj_nrow")
+
+
+def pressed(device):
+  """Returns a batch whose probes press on the organ, and slide."""
+  spec = mujoco.MjSpec.from_string(probed())
+  spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+  batch = palpate.batch.make(spec, 3, device, deterministic=True)
+  for k in range(40):
+    batch.ctrl = np.array([[-0.0002 * k, 0.0], [-0.00015 * k, 0.0001 * k], [0.0, 0.0]])
+    batch.step()
+  return batch
+
+
+def shuffle(batch, random):
+  """Lets contacts have asked for their rows in another order."""
+  efc, contact = batch.d.efc, batch.d.contact
+  count, adr = batch.d.nefc.numpy(), contact.efc_address.numpy().copy()
+  arrays = {name: getattr(efc, name).numpy().copy() for name in ROWS}
+  blocks = efc.jtdaj_adr.numpy().copy(), efc.jtdaj_nrow.numpy().copy()
+  for w in range(batch.nworld):
+    n, number = int(count[w]), int(efc.jtdaj_nblock.numpy()[w])
+    own = {first: k for k, first in enumerate(blocks[0][w, :number])}
+    mixed = random.permutation(sorted(own))
+    order = np.concatenate([first + np.arange(blocks[1][w, own[first]]) for first in mixed] or [[]])
+    order = order.astype(int)
+    assert len(order) == n
+    place = np.argsort(order)
+    for values in arrays.values():
+      values[w, :n] = values[w, order]
+    mine = np.flatnonzero((contact.worldid.numpy() == w) & (adr[:, 0] >= 0))
+    mine = mine[mine < batch.d.nacon.numpy()[0]]
+    adr[mine] = np.where(adr[mine] >= 0, place[np.maximum(adr[mine], 0)], -1)
+    nrow = [blocks[1][w, own[first]] for first in mixed]
+    blocks[0][w, :number], blocks[1][w, :number] = np.cumsum([0, *nrow])[:-1], nrow
+  for name, values in arrays.items():
+    getattr(efc, name).assign(values)
+  efc.jtdaj_adr.assign(blocks[0])
+  efc.jtdaj_nrow.assign(blocks[1])
+  contact.efc_address.assign(adr)
+
+
+def rows(batch):
+  """Returns what rows there are, which contacts have them, and their blocks."""
+  efc, contact = batch.d.efc, batch.d.contact
+  found = {"address": [contact.efc_address.numpy()[: batch.d.nacon.numpy()[0]].copy()]}
+  for names, counts in ((ROWS, batch.d.nefc), (BLOCKS, efc.jtdaj_nblock)):
+    for name in names:
+      worlds = zip(getattr(efc, name).numpy(), counts.numpy(), strict=True)
+      found[name] = [values[:n].copy() for values, n in worlds]
+  return found
+
+
+def equal(a, b):
+  return all(np.array_equal(x, y) for name in a for x, y in zip(a[name], b[name], strict=True))
+
+
+def test_rows_come_in_the_same_order_whoever_asked_first():
+  batch = pressed("warp-cpu")
+  order = FixedOrder(batch.m, batch.d)
+  order.sort()
+  first = rows(batch)
+  assert min(batch.d.nefc.numpy()[:2]) >= 6
+  shuffle(batch, np.random.RandomState(0))
+  assert not equal(rows(batch), first)
+  order.sort()
+  assert equal(rows(batch), first)
+
+
+@pytest.mark.parametrize("device", ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)])
+def test_runs_repeat_to_the_bit(device):
+  a, b = (pressed(device) for _ in range(2))
+  for name in ("qpos", "qvel", "sensordata"):
+    assert np.array_equal(getattr(a, name).numpy(), getattr(b, name).numpy()), name
+  found = [each.organ("organ").contact_force.numpy() for each in (a, b)]
+  assert np.array_equal(found[0], found[1]) and np.abs(found[0]).max() > 0.01
+
+
+def test_what_is_not_known_is_left_to_warp():
+  batch = palpate.batch.make(
+    mujoco.MjSpec.from_string(probed()), 1, "warp-cpu", deterministic=True
+  )
+  assert is_enough(batch.m, batch.bare)
+  batch.bare.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
+  assert not is_enough(batch.m, batch.bare)
