@@ -22,7 +22,7 @@ WIDE, PHONE = (1280, 800), (390, 844)
 STATES = {
   "home": (WIDE, None, {}, False),
   "tutorial": (WIDE, "#tab-tutorial", {}, False),
-  "exercise": (WIDE, "[data-task='touch/easy']", {"d": 200}, False),
+  "exercise": (WIDE, "[data-task='touch/easy']", {"z": 100}, False),
   "warning": (WIDE, "[data-task='grasp/easy']", {"d": 2500}, False),
   "two_hands": (WIDE, "[data-task='bimanual/easy']", {"d": 200}, False),
   "card": (WIDE, "[data-task='touch/easy']", {"d": 300}, True),

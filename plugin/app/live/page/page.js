@@ -208,7 +208,7 @@ function teach() {
 
 // What is left to a browser that cannot draw: the exercise as a film.
 function without(error) {
-  mode("exercise");
+  document.body.dataset.mode = "exercise";  // nothing below the import of the view has run
   const film = document.createElement("code"), picture = new Image(), task = asked.get("task") ?? "touch/easy";
   film.textContent = `palpate render ${task} --seconds 10 -o film.mp4`;
   picture.src = `cards/${task.replace("/", "_")}.webp`;
