@@ -243,7 +243,7 @@ class Camera:
     zero = np.zeros((len(lamps), 3))
     return dict(
       near=float(m.vis.map.znear) * extent, far=float(m.vis.map.zfar) * extent, xpos=xpos,
-      xmat=xmat, cam_body=int(self._bodies[m.cam_bodyid[camera]]), bend=self._rows(np.zeros(2)),
+      xmat=xmat, cam_body=int(self._bodies[m.cam_bodyid[camera]]),
       eye=self._rows(np.zeros(3)), look=self._rows(np.eye(3)),
       film=self._rows([0.0, 1.0, 0.0]), count=np.zeros(1, np.int32),
       lamp_kind=np.array([lamp["kind"] for lamp in lamps], np.int32),

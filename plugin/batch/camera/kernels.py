@@ -90,7 +90,6 @@ class View:
   cam_pos: Array(wp.vec3, ("nrow",))  # in the frame of the body [m]
   cam_mat: Array(wp.mat33, ("nrow",))
   fovy: floats("nrow")  # [rad]
-  bend: Array(wp.vec2, ("nrow",))  # radial distortion: k1, k2
   film: Array(wp.vec3, ("nrow",))  # share of smoke, exposure, noise
   count: ints(1)  # pictures so far
   eye: Array(wp.vec3, ("nrow",))  # in the world
@@ -440,9 +439,6 @@ def draw(c: View):
   pixel = 2.0 * wp.tan(0.5 * c.fovy[r]) / float(c.height)
   x = (float(j) + 0.5 - 0.5 * float(c.width)) * pixel
   y = (0.5 * float(c.height) - float(i) - 0.5) * pixel
-  r2 = x * x + y * y
-  bend = 1.0 + r2 * (c.bend[r][0] + r2 * c.bend[r][1])
-  x, y = x * bend, y * bend
   d = c.look[r] * wp.vec3(x, y, -1.0)  # a distance along it is one from the camera's plane
   o = c.eye[r] + c.near * d
   solid, clear = meet(c, r, o, d)
