@@ -139,9 +139,11 @@ class Worlds(Batch):
     self.d = mjw.put_data(
       bare, start, nworld=nworld, nconmax=ncon, njmax=self.njmax, njmax_nnz=nonzero
     )
-    # A contact with an organ has geom -1, of which mujoco_warp's sensors look up the body, counting
-    # from the end: the world's, so that no body of the scene seems touched.
-    self.m.geom_bodyid = wp.array([*bare.geom_bodyid, 0], dtype=int)
+    # A contact with an organ has geom -1, of which mujoco_warp looks up the body, counting from the
+    # end. Contact sensors take the world's, so that no body of the scene seems touched; force
+    # sensors need it as it is, to leave such contacts out as MuJoCo does.
+    if (bare.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT).any():
+      self.m.geom_bodyid = wp.array([*bare.geom_bodyid, 0], dtype=int)
     self.m.opt.warn_overflow = 0  # counted, see `overflow`
     # All worlds wait for the one that takes longest.
     most = _CROWDED if self._crowded else _ITERATIONS
