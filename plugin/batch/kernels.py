@@ -146,14 +146,17 @@ class Whole:
   count: int  # pieces
   inside: floats("nworld", 2)  # volume stiffness and pressure
   pieces: ints("nworld")
+  opened: ints("nworld")  # whether it is cut
+  own: ints("nworld")  # see `Meshes`
 
 
 @wp.kernel(enable_backward=False)
 def heal(p: Patch, s: Whole):
-  """Gives the worlds of a mask the first mesh."""
+  """Gives the worlds of a mask their whole mesh: the first one, or their own."""
   w = wp.tid()
-  if p.mask[w] and p.mesh[w] > 0:
-    p.mesh[w] = 0
+  if p.mask[w] and s.opened[w] > 0:
+    s.opened[w] = 0
+    p.mesh[w] = wp.where(s.own[w] > 0, 1 + w, 0)
     s.pieces[w] = s.count
     for k in range(s.inside.shape[1]):
       p.tissue.number[w, s.first + k] = s.inside[w, k]

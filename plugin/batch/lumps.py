@@ -48,19 +48,18 @@ class Lumps:
 
   Args:
     organ: its declaration
-    body: its tissue in all worlds, whose `lump` is filled
+    body: its tissue in all worlds, whose `lump` is filled where they have one mesh
   """
 
   def __init__(self, organ: "Declaration", body):
     self._device, self._nelem = body.device, organ.mesh.nelem
-    body.fields.lump = allocate(Lump, body.device, body.sizes | {"nlump": body.nworld})
     self.node = wp.zeros((body.nworld, body.shape.nnode), dtype=float, device=body.device)
-    lump = body.fields.lump
     maps = {"node": _around(organ.mesh, body)}
-    if body.is_solid:
-      maps |= _solid_maps(organ, body)
-    else:
-      maps |= _maps(organ, body)
+    if not organ.mesh.spare:  # else each world has what follows in its mesh, see `Cuts.stiffen`
+      body.fields.lump = allocate(Lump, body.device, body.sizes | {"nlump": body.nworld})
+      maps |= _solid_maps(organ, body) if body.is_solid else _maps(organ, body)
+    lump = body.fields.lump
+    if not (body.is_solid or organ.mesh.spare):
       lump.hinge_left.assign(_left(organ, body))
     self._maps = [
       (self._put(map), _rows(self.node if name == "node" else getattr(lump, name)))
@@ -89,8 +88,10 @@ def _rows(array: wp.array) -> wp.array:
 def _around(mesh, body) -> sparse.csr_matrix:
   """Returns the matrix from factors of triangles to their means around nodes."""
   node, nelem = body.shape.node.numpy(), mesh.nelem
-  entries = node[mesh.elem].ravel(), np.repeat(np.arange(nelem), 3)
-  around = sparse.csr_matrix((np.ones(3 * nelem), entries), shape=(body.shape.nnode, nelem))
+  alone = np.setdiff1d(np.arange(body.shape.nnode), node[mesh.elem])  # padding, and spare vertices
+  row = np.concatenate([node[mesh.elem].ravel(), alone])
+  col = np.concatenate([np.repeat(np.arange(nelem), 3), np.zeros(len(alone), int)])
+  around = sparse.csr_matrix((np.ones(len(row)), (row, col)), shape=(body.shape.nnode, nelem))
   total = np.maximum(np.asarray(around.sum(axis=1)).ravel(), 1.0)
   return sparse.csr_matrix(sparse.diags_array(1.0 / total) @ around)
 

@@ -141,20 +141,18 @@ class Material:
     self._worlds["scale"][worlds] = scale
     self._worlds["young"][worlds] = scale * np.mean(self._young * factor, axis=1)
     self._most[worlds] = factor.max(axis=1)
+    first, topology = self._lumps is None, self._organ.topology
+    if first and factor.shape[1] == 1:
+      return
     if self._lumps is None:
-      if factor.shape[1] == 1:
-        return
-      if self._organ.topology:
-        raise ValueError(
-          f"organ {self._organ.name!r}: young has a number a triangle, which a batch on a GPU "
-          "cannot do where spare is set; expected one a world"
-        )
       self._lumps = Lumps(self._organ.declared, self._organ.body)
       self._organ.patch.lump = self._lumps.node
-      self._lumps.put(worlds, factor)
+    self._lumps.put(worlds, factor)
+    if topology:
+      young = np.broadcast_to(self._young * factor, (len(worlds), self._young.size))
+      topology.stiffen(worlds, young)
+    if first:
       self.batch.record()
-    else:
-      self._lumps.put(worlds, factor)
 
   def _weigh(self, worlds: np.ndarray, scale: np.ndarray):
     if not (_LIGHTEST <= scale.min() and scale.max() <= _HEAVIEST):

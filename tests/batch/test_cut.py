@@ -130,6 +130,47 @@ def test_a_cut_world_goes_on_as_the_plugin_does(device, windows, keys):
   assert device == "cpu" or not batch.overflow.numpy().any()
 
 
+@pytest.mark.parametrize("device", BACKENDS[1:])
+@pytest.mark.parametrize("kind", ["membrane", "nodal shell", "solid"])
+def test_a_lump_stays_through_cuts_and_resets(device, kind):
+  """Worlds of one tissue, with a hard place, and with that once they have been cut."""
+  solid, forces, places = kind == "solid", [], []
+  spec = block(True) if solid else pressed(kind == "membrane", bend=float(kind != "membrane"))
+  path = THROUGH - [0.015, 0, 0] if solid else LINE
+  how = {"depth": 0.012, "direction": [0, 0, -1]} if solid else {}
+  for where in (device, "cpu"):
+    batch = palpate.batch.make(spec.copy(), 3, device=where, nodes=40)
+    organ, found = batch.organ("organ"), []
+    middle = organ.xpos.numpy()[0][organ.elem].mean(axis=1)
+    top = middle[:, 2].max()
+    hard = np.where(np.linalg.norm(middle - [0, 0, top], axis=1) < 0.02, 8e4, 2e4)
+    organ.configure([False, True, solid], young=np.stack([hard] * 3))
+    for cuts in (True, False, True):
+      if cuts:
+        organ.cut([path] * 3, np.array([False, True, True]), **how)
+      if not found and not solid:  # whose plugin takes young of the walls too
+        organ.configure([False, False, True], young=np.stack([hard] * 3))
+      for k in range(40):
+        batch.ctrl = np.full((3, 1), -0.013 * k / 40)
+        batch.step()
+        found.append(organ.contact_force.numpy().sum(axis=1)[:, 2])
+      places.append(organ.xpos.numpy())
+      batch.reset()
+    forces.append(np.array(found))
+  peak = np.abs(forces[1]).max(axis=0)
+  off = np.abs(forces[0] - forces[1]) / peak
+  # A tool that moves meets the mean inertia of a lump, as it does without room for cuts.
+  assert (np.sqrt(np.mean(off**2, axis=0)) < 0.03).all() and off[[39, 79, 119]].max() < 0.006
+  there = np.isfinite(places[0]).all(axis=2) & np.isfinite(places[3]).all(axis=2)
+  assert there.sum() > 400 and np.abs(places[0][there] - places[3][there]).max() < 1e-4
+  assert np.abs(places[0][1] - places[0][2])[there[1]].max() < 1e-6  # whenever it was hardened
+  whole, again = forces[0][40:80], forces[0][80:]
+  np.testing.assert_allclose(again, forces[0][:40], atol=1e-4 * peak[1])
+  assert abs(whole[-1, 1]) > 1.05 * abs(whole[-1, 0])  # hard still
+  np.testing.assert_allclose(whole[:, 1], whole[:, 2], atol=1e-4 * peak[1])
+  assert not any(organ.cuts)
+
+
 def test_blades_cut_in_each_world(device):
   batch = palpate.batch.make(strip(), 3, device=device)
   model, data = batch.model, mujoco.MjData(batch.model)

@@ -14,6 +14,7 @@ import warp as wp
 from palpate.engine.cutting.cuts import topology_of
 from palpate.forces import passive
 from palpate.tissue import step
+from palpate.tissue.config import Config
 from palpate.tissue.cutting import facets, topology
 from palpate.tissue.cutting.cut import Cut
 from palpate.tissue.cutting.cut import Motion as Carried
@@ -84,12 +85,14 @@ class Cuts(passive.Opening):
     self._facets.aim(self._meshes.arrays | starts, node, body.shape.nnode)
     number = body.tissue.number.numpy()[:, _INSIDE : _INSIDE + 2]
     self._worlds: dict[int, World] = {}
+    self._configs: dict[int, Config] = {}  # of worlds whose tissue is their own
     self._row: dict[int, int] = {}  # of `_motion`, between `begin` and `finish`
     self._changed: dict[int, list[np.ndarray]] = {}  # vertices and elements, see `finish`
     self._whole_count = topology.count(self.whole)
     self._intact = fill(kernels.Whole, body.device, {
       "first": _INSIDE, "count": self._whole_count, "inside": number,
-      "pieces": np.full(body.nworld, self._whole_count),
+      "pieces": np.full(body.nworld, self._whole_count), "opened": np.zeros(body.nworld),
+      "own": self._meshes.own,
     })  # fmt: skip
 
   # What there is.
@@ -98,8 +101,8 @@ class Cuts(passive.Opening):
     """Forgets what worlds were that have been reset."""
     if not self._worlds:
       return
-    which = self._meshes.which.numpy()
-    for world in [world for world in self._worlds if not which[world]]:
+    opened = self._intact.opened.numpy()
+    for world in [world for world in self._worlds if not opened[world]]:
       self._forget(world)
 
   def _forget(self, world: int):
@@ -138,9 +141,29 @@ class Cuts(passive.Opening):
   # Within a step.
 
   def heal(self):
-    """Gives the worlds of the mask the first mesh; `rest` has put back the rest."""
+    """Gives the worlds of the mask their whole mesh; `rest` has put back the rest."""
     inputs, body = [self._organ.patch, self._intact], self._organ.body
     wp.launch(kernels.heal, dim=body.nworld, inputs=inputs, device=body.device)
+    self._meshes.restore(self._organ.patch.mask)
+
+  def stiffen(self, worlds: np.ndarray, young: np.ndarray):
+    """Gives worlds a Young's modulus of their own of each triangle [Pa], (worlds, nelem)."""
+    self.follow()
+    organ, whole = self._organ, self.whole
+    every, cut = np.arange(len(whole.tet) or whole.nelem), []
+    for world, own in zip(worlds.tolist(), young, strict=True):
+      self._configs[world] = dataclasses.replace(organ.config, young=tuple(own.tolist()))
+      had = self._worlds.pop(world, None)
+      self._meshes.heal(world)
+      skip, config, pinned = self._meshes.open(world), self._configs[world], ~organ.declared.free
+      self._facets.write(whole, whole, every, config, pinned, skip)
+      self._meshes.keep([world])
+      if had:
+        self._become(world, self._of(world), had, every)
+        cut.append(world)
+    self._meshes.upload(worlds.tolist())
+    if cut:
+      self._upload(cut)
 
   def renumber(self, worlds: np.ndarray, number: np.ndarray, rows: dict[str, np.ndarray]):
     """Keeps bulk and pressure of worlds for when they are whole again: where one is open they end.
@@ -178,7 +201,8 @@ class Cuts(passive.Opening):
     """Returns what a path makes of a world."""
     organ, k = self._organ, self._row[world]
     had, moving = self._of(world), (self._motion.disp[k], self._motion.vel[k])
-    found = self._topology.find(had, *moving, path, organ.config, organ.forces.springs(world))
+    config = self._configs.get(world, organ.config)
+    found = self._topology.find(had, *moving, path, config, organ.forces.springs(world))
     kept = (getattr(found.motion, name).copy() for name in ("mass", "disp", "vel"))
     return dataclasses.replace(found, motion=Carried(*kept))
 
@@ -232,8 +256,8 @@ class Cuts(passive.Opening):
     """Writes the row of a world, in which triangles have changed."""
     organ, mesh = self._organ, now.mesh
     touched, pinned = self._facets.touched(had.mesh, mesh, changed), ~organ.declared.free
-    skip = self._meshes.open(world)
-    self._facets.write(had.mesh, mesh, changed, organ.config, pinned, skip)
+    skip, config = self._meshes.open(world), self._configs.get(world, organ.config)
+    self._facets.write(had.mesh, mesh, changed, config, pinned, skip)
     self._worlds[world] = now
     kept = self._changed.get(world)
     self._changed[world] = (
@@ -264,10 +288,14 @@ class Cuts(passive.Opening):
         if not self._worlds[world].mesh.closed:
           number[world, _INSIDE : _INSIDE + 2] = 0.0
       body.tissue.number.assign(number)
-    count = self._intact.pieces.numpy()
-    count[worlds] = [self._worlds[world].pieces for world in worlds]
-    self._intact.pieces.assign(count)
+    self._count(worlds, [self._worlds[world].pieces for world in worlds], 1)
     organ.wake(worlds)
+
+  def _count(self, worlds: list[int], pieces: list[int], opened: int):
+    for array, values in ((self._intact.pieces, pieces), (self._intact.opened, opened)):
+      rows = array.numpy()
+      rows[worlds] = values
+      array.assign(rows)
 
   # Motion of some worlds, to the host and back.
 
@@ -324,11 +352,9 @@ class Cuts(passive.Opening):
     if found.mesh is self.whole and world in self._worlds:
       self._forget(world)
       which = self._meshes.which.numpy()
-      which[world] = 0
+      which[world] = 1 + world if world in self._configs else 0
       self._meshes.which.assign(which)
-      count = self._intact.pieces.numpy()
-      count[world] = self._whole_count
-      self._intact.pieces.assign(count)
+      self._count([world], [self._whole_count], 0)
 
   @staticmethod
   def is_cut(own: np.ndarray, spans: dict[str, slice]) -> bool:

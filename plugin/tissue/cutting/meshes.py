@@ -2,7 +2,8 @@
 
 The first row is the mesh that all have at first. Kernels see arrays in it and how far it is to the
 next one (`Shape.stride`), so that worlds that were not cut read the same memory. Rows are written
-on the host, by what writes a cut into a body, and go to the device as they are.
+on the host, by what writes a cut into a body, and go to the device as they are. A world whose whole
+mesh is of other tissue has a row from the first, and a copy of that to come back to.
 """
 
 from __future__ import annotations
@@ -28,6 +29,15 @@ def _turn(world: wp.array[int], more: wp.array3d[float], angle: wp.array3d[float
   angle[1 + w, s, lane] = angle[1 + w, s, lane] + more[w, s, lane]
 
 
+@wp.kernel(enable_backward=False)
+def _restore(
+  mask: wp.array[wp.bool], own: wp.array[int], home: wp.array2d[int], row: wp.array2d[int]
+):
+  w, i = wp.tid()
+  if mask[w] and own[w] > 0:
+    row[1 + w, i] = home[w, i]
+
+
 class Meshes:
   """The meshes of a body's worlds: the first one, and room for one more a world.
 
@@ -40,6 +50,7 @@ class Meshes:
     which: which mesh each world has, the first one at first (nworld,)
     more: views of those arrays, with a row a mesh
     here: the same on the host, with a row a world
+    own: whether a world has a whole mesh of its own, see `keep` (nworld,)
     arrays: all arrays of the first of these rows; those of others are `open` words on
   """
 
@@ -61,6 +72,9 @@ class Meshes:
     # Memory that the system gives when it is written to.
     self._rows = np.empty((body.nworld, self.nword), np.int32)
     self._begun: set[int] = set()  # worlds that have been cut
+    self._homes: dict[int, np.ndarray] = {}  # rows of those whose whole mesh is their own
+    self._home: wp.array | None = None  # the same on the device
+    self.own = wp.zeros(body.nworld, dtype=int, device=self._device)
     self.arrays = self._views(self._rows.ctypes.data, wp.get_device("cpu"))
     self.here = {name: self.of(self._rows)[name] for name in more}
     nrow = 1 + body.nworld
@@ -101,11 +115,30 @@ class Meshes:
     self._begun.discard(world)
 
   def open(self, world: int) -> int:
-    """Makes a world's row that of the first mesh where it has none; returns where it starts."""
+    """Makes a world's row that of its whole mesh where it has none; returns where it starts."""
     if world not in self._begun:
-      self._rows[world] = self._first
+      self._rows[world] = self._homes.get(world, self._first)
       self._begun.add(world)
     return world * self.nword
+
+  def keep(self, worlds: list[int]):
+    """Lets the rows of worlds, as they are, be their whole meshes from now on."""
+    if self._home is None:
+      shape = (len(self._rows), self.nword)
+      self._home = wp.zeros(shape, dtype=int, device=self._device)
+    own = self.own.numpy()
+    for world in worlds:
+      self._homes[world] = self._rows[world].copy()
+      row = wp.array(self._homes[world], dtype=int, device=self._device)
+      wp.copy(self._home.flatten(), row, dest_offset=world * self.nword, count=self.nword)
+    own[worlds] = 1
+    self.own.assign(own)
+
+  def restore(self, mask: wp.array):
+    """Gives the worlds of a mask their whole meshes again, of those that have their own."""
+    if self._home is not None:
+      inputs = [mask, self.own, self._home, self._memory]
+      wp.launch(_restore, dim=self._home.shape, inputs=inputs, device=self._device)
 
   def upload(self, worlds: list[int]):
     """Writes the rows of worlds, ascending, to the device, which have them from then on."""
