@@ -25,7 +25,7 @@ from . import host, kernels, states, strip_organs
 from .base import Batch, refuse_crowd, room_of
 from .camera import Camera
 from .contact import contacts, convex
-from .fixed_order import FixedOrder, is_enough
+from .contact.fixed_order import FixedOrder, is_enough
 from .organs import Organ
 from .private import DeterminismType, OverflowType
 from .reset import Rest

@@ -5,7 +5,7 @@ import numpy as np
 import palpate.batch
 import pytest
 from devices import needs_cuda
-from palpate.batch.fixed_order import FixedOrder, is_enough
+from palpate.batch.contact.fixed_order import FixedOrder, is_enough
 from scenes import probed
 
 ROWS = ("type", "id", "J_rownnz", "J_rowadr", "pos", "margin", "D", "vel", "aref", "frictionloss")

@@ -20,8 +20,8 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
-from . import private
-from .private import ConstraintType
+from .. import private
+from ..private import ConstraintType
 
 _INTS = ("type", "id", "J_rownnz", "J_rowadr")
 _FLOATS = ("pos", "margin", "D", "vel", "aref", "frictionloss")
