@@ -52,8 +52,6 @@ def laparoscope(path: pathlib.Path, size: tuple[int, int]) -> Iterator[Callable[
     path: of the film
     size: width and height [pixels]
   """
-  from palpate.tasks.core.scenes import CAMERA
-
   due = -math.inf
   with write(path, _FPS) as frame:
 
@@ -61,10 +59,17 @@ def laparoscope(path: pathlib.Path, size: tuple[int, int]) -> Iterator[Callable[
       nonlocal due
       if env.physics.time() >= due - 1e-9:
         due = env.physics.time() + 1 / _FPS
-        camera = env.physics.model.ptr.camera(CAMERA).id
-        frame(env.physics.render(size[1], size[0], camera_id=camera))
+        frame(_look(env, size))
 
     yield shoot
+
+
+def _look(env: Any, size: tuple[int, int]) -> np.ndarray:
+  """Returns the laparoscope's picture of an environment, (height, width, 3) uint8."""
+  from palpate.tasks.core.scenes import CAMERA
+
+  camera = env.physics.model.ptr.camera(CAMERA).id
+  return env.physics.render(size[1], size[0], camera_id=camera)
 
 
 class Strip:
@@ -84,14 +89,11 @@ class Strip:
 
   def __call__(self, env: Any) -> None:
     """Takes the laparoscope's picture if it is due."""
-    from palpate.tasks.core.scenes import CAMERA
-
     time = env.physics.time()
     if time < self._due - 1e-9:
       return
-    camera = env.physics.model.ptr.camera(CAMERA).id
     try:
-      self._frames.append(env.physics.render(self._size[1], self._size[0], camera_id=camera))
+      self._frames.append(_look(env, self._size))
     except Exception:  # each backend of OpenGL has its own
       self._due = math.inf
       return

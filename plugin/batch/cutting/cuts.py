@@ -149,21 +149,24 @@ class Cuts(passive.Opening):
   def stiffen(self, worlds: np.ndarray, young: np.ndarray):
     """Gives worlds a Young's modulus of their own of each triangle [Pa], (worlds, nelem)."""
     self.follow()
-    organ, whole = self._organ, self.whole
-    every, cut = np.arange(len(whole.tet) or whole.nelem), []
-    for world, own in zip(worlds.tolist(), young, strict=True):
+    organ, whole, some = self._organ, self.whole, worlds.tolist()
+    every, pinned = np.arange(len(whole.tet) or whole.nelem), ~organ.declared.free
+    for world, own in zip(some, young, strict=True):
       self._configs[world] = dataclasses.replace(organ.config, young=tuple(own.tolist()))
-      had = self._worlds.pop(world, None)
       self._meshes.heal(world)
-      skip, config, pinned = self._meshes.open(world), self._configs[world], ~organ.declared.free
-      self._facets.write(whole, whole, every, config, pinned, skip)
-      self._meshes.keep([world])
-      if had:
-        self._become(world, self._of(world), had, every)
-        cut.append(world)
-    self._meshes.upload(worlds.tolist())
+      skip = self._meshes.open(world)
+      self._facets.write(whole, whole, every, self._configs[world], pinned, skip)
+    self._meshes.keep(some)
+    self._meshes.upload(some)
+    cut = [world for world in some if world in self._worlds]
+    for world in cut:
+      had = self._worlds.pop(world)
+      self._become(world, self._of(world), had, every)
     if cut:
       self._upload(cut)
+
+  def _config(self, world: int) -> Config:
+    return self._configs.get(world, self._organ.config)
 
   def renumber(self, worlds: np.ndarray, number: np.ndarray, rows: dict[str, np.ndarray]):
     """Keeps bulk and pressure of worlds for when they are whole again: where one is open they end.
@@ -201,8 +204,8 @@ class Cuts(passive.Opening):
     """Returns what a path makes of a world."""
     organ, k = self._organ, self._row[world]
     had, moving = self._of(world), (self._motion.disp[k], self._motion.vel[k])
-    config = self._configs.get(world, organ.config)
-    found = self._topology.find(had, *moving, path, config, organ.forces.springs(world))
+    held = organ.forces.springs(world)
+    found = self._topology.find(had, *moving, path, self._config(world), held)
     kept = (getattr(found.motion, name).copy() for name in ("mass", "disp", "vel"))
     return dataclasses.replace(found, motion=Carried(*kept))
 
@@ -256,8 +259,8 @@ class Cuts(passive.Opening):
     """Writes the row of a world, in which triangles have changed."""
     organ, mesh = self._organ, now.mesh
     touched, pinned = self._facets.touched(had.mesh, mesh, changed), ~organ.declared.free
-    skip, config = self._meshes.open(world), self._configs.get(world, organ.config)
-    self._facets.write(had.mesh, mesh, changed, config, pinned, skip)
+    skip = self._meshes.open(world)
+    self._facets.write(had.mesh, mesh, changed, self._config(world), pinned, skip)
     self._worlds[world] = now
     kept = self._changed.get(world)
     self._changed[world] = (

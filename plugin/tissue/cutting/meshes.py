@@ -122,15 +122,13 @@ class Meshes:
     return world * self.nword
 
   def keep(self, worlds: list[int]):
-    """Lets the rows of worlds, as they are, be their whole meshes from now on."""
+    """Lets the rows of worlds, ascending, as they are be their whole meshes from now on."""
     if self._home is None:
-      shape = (len(self._rows), self.nword)
-      self._home = wp.zeros(shape, dtype=int, device=self._device)
-    own = self.own.numpy()
+      self._home = wp.zeros(self._rows.shape, dtype=int, device=self._device)
     for world in worlds:
       self._homes[world] = self._rows[world].copy()
-      row = wp.array(self._homes[world], dtype=int, device=self._device)
-      wp.copy(self._home.flatten(), row, dest_offset=world * self.nword, count=self.nword)
+    self._send(worlds, self._home, 0)
+    own = self.own.numpy()
     own[worlds] = 1
     self.own.assign(own)
 
@@ -142,14 +140,18 @@ class Meshes:
 
   def upload(self, worlds: list[int]):
     """Writes the rows of worlds, ascending, to the device, which have them from then on."""
-    there, here = self._memory.flatten(), wp.array(self._rows.ravel(), device="cpu", copy=False)
-    ends = np.flatnonzero(np.diff(worlds) > 1) + 1
-    for run in np.split(np.array(worlds), ends):
-      start, count = int(run[0]) * self.nword, len(run) * self.nword
-      wp.copy(there, here, dest_offset=start + self.nword, src_offset=start, count=count)
+    self._send(worlds, self._memory, self.nword)
     which = self.which.numpy()
     which[worlds] = 1 + np.array(worlds)
     self.which.assign(which)
+
+  def _send(self, worlds: list[int], to: wp.array, skip: int):
+    """Copies the rows of worlds, ascending, to a memory with a row a world, `skip` words on."""
+    there, here = to.flatten(), wp.array(self._rows.ravel(), device="cpu", copy=False)
+    ends = np.flatnonzero(np.diff(worlds) > 1) + 1
+    for run in np.split(np.array(worlds), ends):
+      start, count = int(run[0]) * self.nword, len(run) * self.nword
+      wp.copy(there, here, dest_offset=start + skip, src_offset=start, count=count)
 
   def angle(self, worlds: list[int], more: wp.array):
     """Adds to the rest angles of the hinges of worlds; `more` has a row for every world."""
