@@ -21,6 +21,14 @@ def _same_bits(a, b):
   assert a.tobytes() == b.tobytes()
 
 
+def _same_tables(a, b):
+  for table in ("columns", "arrays", "constants"):
+    old, new = getattr(a, table), getattr(b, table)
+    assert old.keys() == new.keys() and old
+    for name in old:
+      _same_bits(new[name], old[name])
+
+
 # The file.
 
 
@@ -29,11 +37,7 @@ def test_round_trip_is_exact(tmp_path):
   path = made.save(tmp_path / "exercise.npz")
   before, after = made.recording(), Recording.load(path)
   _same_bits(after.time, before.time)
-  for table in ("columns", "arrays", "constants"):
-    old, new = getattr(before, table), getattr(after, table)
-    assert old.keys() == new.keys() and old
-    for name in old:
-      _same_bits(new[name], old[name])
+  _same_tables(before, after)
   for field in ("events", "instruments", "settings", "watch", "info"):
     assert getattr(after, field) == getattr(before, field)
   assert after.arrays["action"].dtype == np.float32
@@ -54,11 +58,7 @@ def test_a_journal_is_the_recording_until_it_is_saved(tmp_path):
   assert parts.outcome == "interrupted"
   assert Recording.load_info(path) == parts.info == {**whole.info, "outcome": "interrupted"}
   _same_bits(parts.time, whole.time)
-  for table in ("columns", "arrays", "constants"):
-    old, new = getattr(whole, table), getattr(parts, table)
-    assert old.keys() == new.keys() and old
-    for name in old:
-      _same_bits(new[name], old[name])
+  _same_tables(whole, parts)
   assert parts.events == whole.events and parts.metrics() == whole.metrics()
   data = path.read_bytes()
   assert data.count(b"PART") >= 2
