@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from palpate import models
 from palpate.models import organs, scenery, situs
+from palpate.tissue.geometry.mesh import area_vectors
 from scipy.interpolate import LinearNDInterpolator
 
 NODES, DEPTH = 4000, 0.03  # [m]
@@ -41,8 +42,7 @@ def on_surface(organ: palpate.Organ, pos: np.ndarray, frame: np.ndarray) -> np.n
   """Returns points of the organ that a camera sees along a bow from end to end, (n, 3) [m]."""
   x, elem = organ.xpos, organ.elem
   normal = np.zeros_like(x)
-  each = np.cross(x[elem[:, 1]] - x[elem[:, 0]], x[elem[:, 2]] - x[elem[:, 0]])
-  np.add.at(normal, elem, each[:, None])
+  np.add.at(normal, elem, area_vectors(x, elem)[:, None])
   seen = (x - pos)[(normal * (pos - x)).sum(axis=1) > 0] @ frame
   s = np.linspace(0, 1, 30)[:, None]
   plane = ENDS[0] + s * (ENDS[1] - ENDS[0]) + [0, 0.008] * np.sin(np.pi * s)
