@@ -324,30 +324,32 @@ class Trace(Task):
     flat = size * np.stack([t, wave], axis=1) @ turn.T
     start = center + flat @ across.T
     # Drop along the shaft: the triangle hit from outside that is nearest to the trocar.
-    points, triangles, weights = [], [], []
-    organ, x = physics.organ, physics.nodes()
-    a, b, c = np.moveaxis(x[organ.elem], 1, 0)
-    e1, e2, ray = b - a, c - a, -port.mat[:, 2]
-    p = np.cross(ray, e2)
+    elem, x, ray = physics.organ.elem, physics.nodes(), -port.mat[:, 2]
+    drawn, spread = start @ across, (x @ across)[elem]
+    under = (spread.min(axis=1) <= drawn.max(axis=0)) & (spread.max(axis=1) >= drawn.min(axis=0))
+    under = np.flatnonzero(under.all(axis=1))
+    if not len(under):
+      return None
+    a, b, c = np.moveaxis(x[elem[under]], 1, 0)
+    e1, e2, origin = b - a, c - a, start - 0.1 * ray
+    p, s = np.cross(ray, e2), origin[:, None] - a
+    q = np.cross(s, e1)
     with np.errstate(divide="ignore", invalid="ignore"):
       scale = 1 / np.einsum("ij,ij->i", e1, p)
-      for origin in start - 0.1 * ray:
-        s = origin - a
-        q = np.cross(s, e1)
-        u, v = np.einsum("ij,ij->i", s, p) * scale, (q @ ray) * scale
-        far = np.einsum("ij,ij->i", e2, q) * scale
-        hit = np.flatnonzero((u >= 0) & (v >= 0) & (u + v <= 1) & (far > 0))
-        if len(hit):
-          k = int(hit[np.argmin(far[hit])])
-          points.append(origin + far[k] * ray)
-          triangles.append(k)
-          weights.append((1 - u[k] - v[k], u[k], v[k]))
-    gaps = np.linalg.norm(np.diff(points, axis=0), axis=1) if len(points) == len(start) else [1.0]
-    if np.max(gaps) > STEP or (physics.normals()[triangles] @ -ray).min() < _FACING:
+      u, v = np.einsum("kij,ij->ki", s, p) * scale, (q @ ray) * scale
+      far = np.einsum("ij,kij->ki", e2, q) * scale
+      far[~((u >= 0) & (v >= 0) & (u + v <= 1) & (far > 0))] = np.inf
+    hit = np.arange(DRAWN), far.argmin(axis=1)
+    if not np.isfinite(far[hit]).all():
       return None
-    along = np.concatenate([[0], np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum()])
+    points, triangles = origin + far[hit][:, None] * ray, under[hit[1]]
+    weights = np.stack([1 - u[hit] - v[hit], u[hit], v[hit]], axis=1)
+    gaps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    if gaps.max() > STEP or (physics.normals()[triangles] @ -ray).min() < _FACING:
+      return None
+    along = np.concatenate([[0], gaps.cumsum()])
     keep = np.unique(np.searchsorted(along, np.arange(0, along[-1], STEP)))
-    return np.array(points)[keep], np.array(triangles)[keep], np.array(weights)[keep]
+    return points[keep], triangles[keep], weights[keep]
 
   @property
   def done(self) -> int:
