@@ -75,7 +75,7 @@ class Worlds(Batch):
       for o, t, n in zip(declared, tools, nslots, strict=True)
     )
     bare, slots = strip_organs.strip(spec, model, declared, nslots)
-    self._kept, self.bare = strip_organs.kept(model, declared), bare
+    self._kept, self.bare, self._graphs = strip_organs.kept(model, declared), bare, {}
     with wp.ScopedDevice(target):
       self._put(bare, nslots, tools, deterministic, spaces)
       self._allocate()
@@ -249,7 +249,6 @@ class Worlds(Batch):
 
   def record(self):
     """Records the graphs, on a device that has them."""
-    self._graphs = {}
     work = {"step": self._once, "after": self._after}
     work |= {"reset": self._rest.launch, "look": self._rest.look}
     if not self.device.is_cuda:
@@ -257,8 +256,9 @@ class Worlds(Batch):
         organ.load()
       self._graphs = {name: (None, each) for name, each in work.items()}
       return
-    for each in work.values():
-      each()  # loads the kernels
+    if not self._graphs:  # loads the kernels; what it does to the worlds, their first reset undoes
+      for each in work.values():
+        each()
     for name, each in work.items():
       with wp.ScopedCapture(self.device) as capture:
         each()

@@ -223,6 +223,19 @@ def test_each_world_has_a_tissue_of_its_own(make):
   assert 0 < force[0] < 0.95 * force[1] < 0.9 * force[2]
 
 
+def test_a_new_tissue_leaves_the_state_as_it_is(make):
+  # On CUDA a first tissue a triangle asks for other graphs.
+  batch = make(press(bend=0, foundation=2e4), 2)
+  tissue = batch.organ("organ")
+  batch.ctrl = np.full((2, 1), -0.006)
+  batch.step(60)
+  before = tissue.xpos.numpy().copy(), tissue.xvel.numpy().copy(), batch.time.numpy().copy()
+  tissue.configure([False, True], young=np.linspace(2e4, 4e4, 2 * len(tissue.elem)).reshape(2, -1))
+  for was, now in zip(before, (tissue.xpos, tissue.xvel, batch.time), strict=True):
+    np.testing.assert_array_equal(was, now.numpy())
+  assert np.ptp(before[0], axis=0).max() == 0 < batch.time.numpy().min()
+
+
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_sliding_is_that_of_the_plugin(make, cone):
   _, _, found = slid_beside(make, probed(cone=cone), 220, aside=0.01, wait=100)

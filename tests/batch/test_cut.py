@@ -154,7 +154,7 @@ def test_a_lump_stays_through_cuts_and_resets(device, kind):
         batch.ctrl = np.full((3, 1), -0.013 * k / 40)
         batch.step()
         found.append(organ.contact_force.numpy().sum(axis=1)[:, 2])
-      places.append(organ.xpos.numpy())
+      places.append(organ.xpos.numpy().copy())
       batch.reset()
     forces.append(np.array(found))
   peak = np.abs(forces[1]).max(axis=0)
@@ -305,7 +305,8 @@ THROUGH = np.linspace([0, -0.025, 0.015], [0, 0.025, 0.015], 9)
 @pytest.mark.parametrize("windows", [True, False])
 @pytest.mark.parametrize("device", BACKENDS[1:])
 def test_a_cut_solid_goes_on_as_the_plugin_does(device, windows):
-  batch = palpate.batch.make(block(windows), 3, device=device, nodes=40)
+  # So that worlds of one state stay equal on CUDA, whose contacts are in no order else.
+  batch = palpate.batch.make(block(windows), 3, device, nodes=40, deterministic=True)
   model, data = batch.model, mujoco.MjData(batch.model)
   alone, organ = palpate.Organ(model, data, "organ"), batch.organ("organ")
   first, n = np.array([True, False, False]), alone.nvert
@@ -335,10 +336,9 @@ def test_a_cut_solid_goes_on_as_the_plugin_does(device, windows):
     force.append((alone.contact_force.sum(axis=0)[2], *total))
   force = np.array(force)
   peak = np.abs(force[:, 0]).max()
-  # Contacts are in no order on CUDA.
-  off, alike = (0.02, 1e-4 * peak) if "cuda" in device else (0.01, 0.0)
+  off = 0.02 if "cuda" in device else 0.01
   assert peak > 0.1 and np.sqrt(np.mean((force[:, 0] - force[:, 1]) ** 2)) < off * peak
-  np.testing.assert_allclose(force[:, 1], force[:, 2], atol=alike, rtol=0)
+  np.testing.assert_array_equal(force[:, 1], force[:, 2])
   assert np.abs(force[:, 0] - force[:, 3]).max() > 0.3 * peak  # that is whole
   batch.get_state(0, data)
   mujoco.mj_forward(model, data)
@@ -348,7 +348,7 @@ def test_a_cut_solid_goes_on_as_the_plugin_does(device, windows):
   xpos = organ.xpos.numpy()
   there = np.isfinite(xpos[2]).all(axis=1)
   assert organ.piece_count.numpy().tolist() == [1, 2, 1] and there.sum() == whole
-  np.testing.assert_allclose(xpos[0, there], xpos[2, there], atol=alike and 1e-7, rtol=0)
+  np.testing.assert_array_equal(xpos[0, there], xpos[2, there])
   assert not batch.failures.numpy().any()
 
 
