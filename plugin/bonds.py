@@ -107,6 +107,30 @@ class Bonds:
     """How far each was from what it leads to as the last step began, in the world [m], (n, 3)."""
     return self._written("stretch")
 
+  def distance(self, start: npt.ArrayLike, end: npt.ArrayLike) -> np.ndarray:
+    """Returns how far strands are from a segment, such as a wire's axis [m], (n,).
+
+    A strand goes from what a bond leads to, as the last step began, to its vertex.
+
+    Args:
+      start: of the segment, in the world [m]  (3,)
+      end: of it [m]  (3,)
+    """
+    d, e = np.asarray(end, float) - start, self.stretch
+    r = start - (self.positions - e)
+    dd, de, ee = d @ d, e @ d, (e**2).sum(axis=1)
+    dr, er = r @ d, (e * r).sum(axis=1)
+
+    def share(above: np.ndarray, below: np.ndarray) -> np.ndarray:
+      return np.divide(above, below, where=below > 0, out=np.zeros(len(e))).clip(0, 1)
+
+    # As `between` of core/geom.h: the nearest point of one line, of the other strand, and back.
+    apart = dd * ee - de**2
+    s = share(de * er - dr * ee, np.where(apart > 1e-6 * dd * ee, apart, 0.0))
+    t = share(de * s + er, ee)
+    s = share(de * t - dr, np.full(len(e), dd))
+    return np.linalg.norm(r + s[:, None] * d - t[:, None] * e, axis=1)
+
   @property
   def stored(self) -> float:
     """Elastic energy that they had then, less what the step's damage took of it [J]."""

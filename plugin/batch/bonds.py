@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class Bonds(abc.ABC):
   """The bonds of an organ in all worlds, those that the model declares; arrays as of `Batch`.
 
-  A bond that a cut has divided has the damage of the part that holds best.
+  A bond that a cut has divided has the damage of the part that holds best, and the mean stretch.
 
   Attributes:
     vertices: vertex of each, (n,)
@@ -33,7 +33,9 @@ class Bonds(abc.ABC):
   def __init__(self, nworld: int, device: Any):
     self._device, n = device, len(self.vertices)
     self._damage = wp.zeros((nworld, n), dtype=float, device=device)
-    self._force = wp.zeros((nworld, n, 3), dtype=float, device=device)
+    self._force, self._stretch = (
+      wp.zeros((nworld, n, 3), dtype=float, device=device) for _ in range(2)
+    )
     self._share = wp.zeros(nworld, dtype=float, device=device)
     self._each = wp.array(self.area, dtype=float, device=device)
 
@@ -51,6 +53,12 @@ class Bonds(abc.ABC):
     """Force of each on its vertex in the last step, in the world [N], (nworld, n, 3)."""
     self._tell()
     return self._force
+
+  @property
+  def stretch(self) -> wp.array:
+    """How far each was from what it leads to as the last step began [m], (nworld, n, 3)."""
+    self._tell()
+    return self._stretch
 
   @property
   def share_freed(self) -> wp.array:
@@ -74,7 +82,7 @@ class Bonds(abc.ABC):
 
   @abc.abstractmethod
   def _tell(self):
-    """Brings damage and force up to date."""
+    """Brings damage, force and stretch up to date."""
 
   @abc.abstractmethod
   def _weaken(self, amount: wp.array):
@@ -95,12 +103,14 @@ class OfThreads(Bonds):
     super().__init__(len(handles), batch.device)
 
   def _tell(self):
-    damage, force = self._damage.numpy(), self._force.numpy()
+    damage, force, stretch = self._damage.numpy(), self._force.numpy(), self._stretch.numpy()
     for world, alone in enumerate(self._alone):
       made, part = alone.made, np.where(alone.free, 1.0, np.minimum(alone.damage, HELD))
-      damage[world], force[world] = 1.0, 0.0
+      damage[world], force[world], stretch[world] = 1.0, 0.0, 0.0
       np.minimum.at(damage[world], made, part.astype(np.float32))
       np.add.at(force[world], made, alone.force.astype(np.float32))
+      share = (alone.area / self.area[made])[:, None]
+      np.add.at(stretch[world], made, (share * alone.stretch).astype(np.float32))
 
   def _weaken(self, amount: wp.array):
     rows = amount.numpy().astype(float)
@@ -125,6 +135,7 @@ class Gathered(Bonds):
   def _tell(self):
     self.batch.gather([part.damage for part in self._parts], self._damage)
     self.batch.gather([part.force for part in self._parts], self._force)
+    self.batch.gather([part.stretch for part in self._parts], self._stretch)
 
   def _weaken(self, amount: wp.array):
     rows = amount.numpy()
@@ -145,12 +156,12 @@ class Grown(Bonds):
     self.vertices = np.concatenate([np.zeros(0, int), *(now["vert"] for now in made)])
     self.area = np.concatenate([np.zeros(0), *(now["area"] for now in made)])
     first = np.cumsum([0, *(len(now["vert"]) for now in made)])
-    names = "row", "count", "made", "slot", "state", "pull"
-    self._groups = [
-      fill(BondLists, None, {name: getattr(g.fields, name) for name in names} | {"before": int(k)})
-      for g, k in zip(groups, first, strict=False)
-    ]
+    names = "row", "count", "made", "slot", "area", "state", "pull", "stretch"
     super().__init__(organ.batch.nworld, organ.batch.device)
+    self._groups = []
+    for group, k in zip(groups, first, strict=False):
+      values = {name: getattr(group.fields, name) for name in names}
+      self._groups.append(fill(BondLists, None, values | {"before": int(k), "whole": self._each}))
 
   def _over(self, what: Any, *values: wp.array):
     for lists in self._groups:
@@ -160,7 +171,8 @@ class Grown(Bonds):
   def _tell(self):
     self._damage.fill_(1.0)
     self._force.zero_()
-    self._over(show_bonds, self._damage, self._force)
+    self._stretch.zero_()
+    self._over(show_bonds, self._damage, self._force, self._stretch)
 
   def _weaken(self, amount: wp.array):
     self._over(weaken_bonds, amount)

@@ -246,21 +246,28 @@ class BondLists:
   count: ints("nrow", 1)
   made: ints("nrow", "nbond")
   slot: ints("nrow", "nbond")
+  area: doubles("nrow", "nbond")
   state: doubles("nworld", "nfree", 2)
   pull: doubles("nworld", "nbond", 3)
+  stretch: doubles("nworld", "nbond", 3)
+  whole: floats("nmade")  # area of each that was made [m^2]
 
 
 @wp.kernel(enable_backward=False)
-def show_bonds(b: BondLists, damage: wp.array2d[float], force: wp.array3d[float]):
-  """Takes damage and force of bonds to those that were made."""
+def show_bonds(
+  b: BondLists, damage: wp.array2d[float], force: wp.array3d[float], stretch: wp.array3d[float]
+):
+  """Takes damage, force and stretch of bonds to those that were made, the last as a mean."""
   w, n = wp.tid()
   r = b.row[w]
   if n < b.count[r, 0]:
     i = b.before + b.made[r, n]
     had = b.state[w, b.slot[r, n], 0]
     wp.atomic_min(damage, w, i, wp.where(had >= wp.float64(1.0), 1.0, wp.min(float(had), HELD)))
+    share = float(b.area[r, n]) / b.whole[i]
     for c in range(3):
       wp.atomic_add(force, w, i, c, float(b.pull[w, n, c]))
+      wp.atomic_add(stretch, w, i, c, share * float(b.stretch[w, n, c]))
 
 
 @wp.kernel(enable_backward=False)

@@ -69,7 +69,7 @@ class Burning:
   axis: int  # along which it is long
   actuator: int  # whose control is its power [W]
   half: wp.float64  # of its length [m]
-  reach: wp.float64  # from that line [m]
+  reach: wp.float64  # from that line to a bond's strand [m]
   energy: wp.float64  # that an area takes [J/m^2]
 
 
@@ -256,7 +256,7 @@ class Bonds(Force):
       self.burn(current)
 
   def burn(self, current: dict[str, Any]):
-    """Weakens the bonds near a geom with a current; see `Burning`."""
+    """Weakens the bonds that a geom with a current touches; see `Burning`."""
     for group in self.groups:
       burning = self.host.fill(Burning, current | {"bonds": group.fields})
       self.host.launch(_burn, burning, 1)

@@ -131,6 +131,7 @@ class Cutters(Force):
     n = len(found)
     geom, half, axis = np.full((n, 2), -1), np.zeros((n, 2)), np.zeros((n, 2), int)
     self._width = np.zeros(n)
+    skin = float(mjstruct.view(m.flex_radius, m.nflex)[host.organ.flexes[0]])
     for i, geoms in enumerate(found):
       for k, g in enumerate(geoms):
         geom[i, k] = g
@@ -138,7 +139,7 @@ class Cutters(Force):
         self._width[i] = max(self._width[i], width)
       if rows[i].current:
         actuator, shape = _find_actuator(host, rows[i].current), _shape(host, geoms[0])
-        self.by_current[i] = trails.current(geoms[0], actuator, rows[i].energy, shape)
+        self.by_current[i] = trails.current(geoms[0], actuator, rows[i].energy, shape, skin)
     self.names = [tuple(_name(m, g) for g in geoms) for geoms in found]
     self.geoms = {"geom": geom, "axis": axis, "half": half}
     host.need_springs()

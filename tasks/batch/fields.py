@@ -61,6 +61,7 @@ class Common:
   bond_share: doubles("nbond")  # of their area
   bond_damage: floats("nworld", "nbond")  # 1 where it is free
   bond_force: floats("nworld", "nbond", 3)  # on the organ [N]
+  bond_stretch: floats("nworld", "nbond", 3)  # of the strands, from bed to organ [m]
   bond_loss: floats("nworld", "nbond")  # that an action adds to the damage
   # Of what cuts the organ, see `palpate.batch.cutting.fracture.Cutters`.
   cutter_inside: floats("nworld", "ncutter")

@@ -20,6 +20,8 @@ from .fields import Common
 _CLOSING, _GRIPPING = wp.constant(instrument.CLOSING), wp.constant(instrument.GRIPPING)
 _FOLD, _FORCE = wp.constant(instrument.FOLD), wp.constant(instrument.HELD_FORCE)
 
+_POINT = wp.constant(1e-12)  # square of a strand's length that is none, for rounding [m^2]
+
 
 WORDS: dict[Any, Any] = {  # of Python -> of Warp
   rules.rows: wp.matrix_from_rows, rules.vector: wp.vec3, rules.length: wp.length,
@@ -103,6 +105,16 @@ def bonds(s: Common):
 def bond(s: Common, k: int):
   """See `rules`."""
   return kernels.node(s, s.world, s.bond_vert[k])
+
+
+@word
+def strand_distance(s: Common, k: int, start: wp.vec3, end: wp.vec3):
+  """See `rules`."""
+  strand = wp.vec3(
+    s.bond_stretch[s.world, k, 0], s.bond_stretch[s.world, k, 1], s.bond_stretch[s.world, k, 2]
+  )
+  organ = bond(s, k)
+  return wp.closest_point_edge_edge(start, end, organ - strand, organ, _POINT)[2]
 
 
 @word

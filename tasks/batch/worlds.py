@@ -176,7 +176,8 @@ class Worlds:
     """Brings what holds and cuts the organ up to date."""
     s, organ = self.fields, self.organ
     if s.bond_vert.shape[0]:
-      s.bond_damage, s.bond_force = organ.bonds.damage, organ.bonds.force
+      held = organ.bonds
+      s.bond_damage, s.bond_force, s.bond_stretch = held.damage, held.force, held.stretch
     if s.cutter_inside.shape[1]:
       found = organ.cutters
       s.cutter_inside, s.cutter_length, s.cutter_seat = found.inside, found.length, found.seat

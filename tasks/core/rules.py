@@ -223,6 +223,11 @@ def bond(s: Any, k: int) -> np.ndarray:
   return s.organ.bonds.positions[k]
 
 
+def strand_distance(s: Any, k: int, start: np.ndarray, end: np.ndarray) -> float:
+  """Returns how far a bond's strand, from its bed to the organ, is from a segment [m]."""
+  return float(s.organ.bonds.distance(start, end)[k])
+
+
 def is_free(s: Any, k: int) -> bool:
   """Returns whether a bond has broken."""
   return bool(s.organ.bonds.free[k])

@@ -7,18 +7,21 @@ Own observations: those of `dissect`, and `hook_front` (3,), from the hook to th
 holds [m]; `retracted` (1,), how far the site is from its place at rest, away from the bed, as a
 share of what is needed [-]; `burnt` (1,), share of the burn that is damage [-].
 
-A current frees the bonds within 3 mm of the axis of the hook's wire in 0.2 s: at most 1.3 mm from
-the wire to the organ's surface. What comes free while the site is grasped and retracted by 5 mm,
-with the pull on the liver under its limit and the hook's force under 1.5 N, is `clean`; the rest is
-`torn`: what is not held away is not seen. A current without a bond in reach burns what the hook
-touches; half a second of that is damage, and so is a hook that presses with 3 N. Progress, success
-and failure are those of `dissect`; the bed is too strong to be pulled off.
+A current frees the bonds whose strands the hook's wire touches in 0.2 s: a strand goes from the bed
+to the organ and is as thick as its skin, and a spark leaps 0.3 mm to it. What comes free while the
+site is grasped and retracted by 5 mm, with the pull on the liver under its limit and the hook's
+force under 1.5 N, is `clean`; the rest is `torn`: what is not held away is not seen. A current that
+divides nothing burns what the hook touches; half a second of that is damage, and so is a hook that
+presses with 3 N. Progress, success and failure are those of `dissect`; the bed is too strong to be
+pulled off.
 """
 
 import dataclasses
 import itertools
 
+import mujoco
 import numpy as np
+from palpate.engine.cutting.trails import SPARK
 
 from ..core.base import Physics
 from ..core.performer import Performer, Script
@@ -30,7 +33,6 @@ from ..core.rules import (
   Vector,
   bond,
   bonds,
-  clamp,
   dot,
   is_free,
   last_component,
@@ -40,6 +42,7 @@ from ..core.rules import (
   other_point,
   other_tip,
   point,
+  strand_distance,
   weaken,
 )
 from ..registry import exercise
@@ -53,15 +56,17 @@ from .grasp import FUNDUS
 # pull within the limits does not free it.
 BED = (1e7, 2.5e4, 40.0)
 AWAY = 0.005  # least way of the site from the bed, for what is divided to count [m]
-REACH, RATE = 0.003, 5.0  # of the current around the wire [m], damage that it does to bonds [1/s]
+RATE = 5.0  # damage that the current does to bonds [1/s]
+WIRE = "hook_toe"  # geom of the hook that has it
 TOUCHING, BURN = 0.03, 0.5  # force with which the hook touches [N], time that it may burn [s]
 HOOK_LIMIT, HOOK_DAMAGE = 1.5, 3.0  # of its force, as of other tips without jaws [N]
 SCENE = dataclasses.replace(
   FUNDUS, nodes=250, bonds=BED, second="hook", second_port=(-0.05, -0.01, 0.12)
 )
 # Of the expert: how far it pulls at most [m], how much further than it has to, the share of the
-# largest traction it keeps under, how far the hook stays from a bond and begins above it [m].
-_FAR, _MORE, _SHARE, OFF, _WAITS = 0.03, 0.3, 0.7, 0.0015, 0.01
+# largest traction it keeps under, how far above a bond the hook aims and begins [m], and at what
+# share of the reach it stops.
+_FAR, _MORE, _SHARE, OFF, _WAITS, NEAR = 0.03, 0.3, 0.7, 0.0005, 0.01, 0.92
 
 
 @exercise("bimanual/easy", 40, "easy", "bimanual")
@@ -89,7 +94,9 @@ def hard(**kwargs):
 class State(dissect.State):
   """State of a world."""
 
-  toe: Vector  # other end of the hook's wire, in the frame of its tip [m]
+  heel: Vector  # end of the axis of the hook's wire, in the frame of its tip [m]
+  toe: Vector  # the other end [m]
+  reach: float  # of the current from that axis [m]
   rest: Vector  # the site's place at rest [m]
   away: Vector  # from the bed
   live: bool  # whether the current is on
@@ -116,24 +123,13 @@ def fair(s, o):
 
 def distances(s, o) -> np.ndarray:
   """Returns how far the bonds that hold are from the wire [m]  (n,); free ones are far away."""
-  bonds, heel = s.organ.bonds, other_tip(s)
-  along, offset = other_point(s, o.toe) - heel, bonds.positions - heel
-  share = (offset @ along / (along @ along)).clip(0, 1)
-  far = np.linalg.norm(offset - share[:, None] * along, axis=1)
-  return np.where(bonds.free, np.inf, far)
-
-
-def wire_distance(s, o, k):
-  """Returns how far a bond that holds is from the wire [m]; a free one is far away."""
-  heel = other_tip(s)
-  along, offset = other_point(s, o.toe) - heel, bond(s, k) - heel
-  share = clamp(dot(offset, along) / dot(along, along), 0.0, 1.0)
-  return FAR if is_free(s, k) else length(offset - share * along)
+  far = s.organ.bonds.distance(other_point(s, o.heel), other_point(s, o.toe))
+  return np.where(s.organ.bonds.free, np.inf, far)
 
 
 def divide(s, o):
   """Weakens the bonds in reach of the wire; returns whether there are any."""
-  near = distances(s, o) < REACH
+  near = distances(s, o) < o.reach
   if near.any():
     s.organ.bonds.weaken(RATE * o.control_timestep * near)
   return bool(near.any())
@@ -143,23 +139,26 @@ def divide(s, o):
 def _divide(s, o):
   found = int(0)  # noqa: RUF046, UP018 - a variable to Warp
   for k in range(bonds(s)):
-    if wire_distance(s, o, k) < REACH:
+    far = strand_distance(s, k, other_point(s, o.heel), other_point(s, o.toe))
+    if far < o.reach and not is_free(s, k):
       weaken(s, k, RATE * o.control_timestep)
       found += 1
   return found > 0
 
 
-def nearest(s, o):
-  """Returns where the bond is that holds and is nearest to the wire [m]."""
-  return s.organ.bonds.positions[distances(s, o).argmin()]
+def nearest(s):
+  """Returns where the bond is that holds and is nearest to the hook's tip [m]."""
+  bonds = s.organ.bonds
+  far = np.linalg.norm(bonds.positions - other_tip(s), axis=1)
+  return bonds.positions[np.where(bonds.free, np.inf, far).argmin()]
 
 
 @many(nearest)
-def _nearest(s, o):
+def _nearest(s):
   found, least = int(0), float(FAR)  # noqa: RUF046, UP018 - variables to Warp
   for k in range(bonds(s)):
-    far = wire_distance(s, o, k)
-    if far < least:
+    far = length(bond(s, k) - other_tip(s))
+    if far < least and not is_free(s, k):
       least = far
       found = k
   return bond(s, found)
@@ -189,7 +188,7 @@ def advance(s, o):
 def observe(s, o):
   """Finds what `dissect` does, hook_front, retracted and burnt."""
   o = look(s, o)
-  o.hook_front = nearest(s, o) - other_tip(s)
+  o.hook_front = nearest(s) - other_tip(s)
   o.retracted = retraction(s, o) / AWAY
   o.burnt = min(o.time / BURN, 1.0)
   return o
@@ -218,8 +217,13 @@ class Bimanual(Dissect):
     """Draws the site to grasp."""
     super().begin(physics)
     self.time, self.powered, self.wasted, self.live = 0.0, 0.0, 0.0, False
-    heel, toe = (physics.data.site(f"{self.second}{end}") for end in ("tip", "toe"))
-    self.toe = heel.xmat.reshape(3, 3).T @ (toe.xpos - heel.xpos)
+    model, data = physics.model, physics.data
+    wire, tip = data.geom(f"{self.second}{WIRE}"), data.site(f"{self.second}tip")
+    width, half, _ = model.geom(f"{self.second}{WIRE}").size
+    ends = wire.xpos + half * np.array([[-1], [1]]) * wire.xmat.reshape(3, 3)[:, 2]
+    self.heel, self.toe = (ends - tip.xpos) @ tip.xmat.reshape(3, 3)
+    flex = mujoco.mj_name2id(model.ptr, mujoco.mjtObj.mjOBJ_FLEX, physics.organ_name)
+    self.reach = float(width + model.flex_radius[flex] + SPARK)
     self.rest = physics.point(self.site)
     away = self.rest - middle(physics)
     self.away = away / np.linalg.norm(away)
@@ -280,10 +284,10 @@ class Bimanual(Dissect):
       near = held[np.linalg.norm(bonds.positions[held] - p.tip, axis=1).argmin()]
       yield from p.above(bonds.positions[near], _WAITS, up)
       while self.outcome is None and fair(physics, self) and not bonds.free[near]:
-        goal = bonds.positions[near]
-        step = goal + OFF * up - p.tip
-        far = float(np.linalg.norm(step))
-        reach = 0.02 * p.style.speed * self.control_timestep
-        p.tip = p.tip + step * min(1.0, reach / max(far, 1e-9))
-        p.extra[:] = 1.0 if np.linalg.norm(p.hand.tip_pos() - goal) < 0.8 * REACH else -1.0
+        apart = distances(physics, self)[near] / self.reach
+        p.extra[:] = 1.0 if apart < 1.0 else -1.0
+        if apart > NEAR:
+          step = bonds.positions[near] + OFF * up - p.tip
+          most = 0.02 * p.style.speed * self.control_timestep
+          p.tip = p.tip + step * min(1.0, most / max(float(np.linalg.norm(step)), 1e-9))
         yield p.step()

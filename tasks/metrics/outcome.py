@@ -148,7 +148,7 @@ def current_time(current: ArrayLike) -> float:
 
 @metric("Current without a target", "s", "safety", "all", "as `current_time`")
 def current_wasted(idle_current: ArrayLike) -> float:
-  """Returns how long a current was on with nothing to free in reach [s], lower is better.
+  """Returns how long a current was on without touching what it is to free [s], lower is better.
 
   Args:
     idle_current: time so far [s]  (nstep,)

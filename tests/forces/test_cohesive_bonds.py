@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
+from scipy.spatial import cKDTree
 
 SOFT = {"young": 3e4, "tolerance": 1e-7}
 LAW = (1e6, 100.0, 0.05)  # stiffness [N/m^3], strength [Pa], energy [J/m^2]
@@ -383,6 +384,22 @@ def test_a_current_weakens_what_is_near_it(make):
     mujoco.mj_step2(model, data)
   np.testing.assert_array_equal(organ.bonds.damage, 1.0 * near)
   assert near.any() and not near.all() and organ.bonds.energy == pytest.approx(0, abs=1e-9)
+
+
+def test_the_distance_of_a_strand_is_that_of_its_nearest_point(make):
+  model, data, organ = make(bonds="none")
+  mujoco.mj_forward(model, data)
+  organ.bond("hand", 1e4, 1e5, 1e6, vertices=np.arange(40))
+  data.mocap_pos[0] += [0.004, 0.003, 0.01]
+  for _ in range(3):
+    mujoco.mj_step(model, data)
+  bonds, share = organ.bonds, np.linspace(0, 1, 400)
+  assert np.linalg.norm(bonds.stretch, axis=1).min() > 0.005
+  for start, end in [([0, 0, 0.05], [0.01, 0.02, 0.06]), ([0.03, 0, 0], [0.03, 0, 0.0])]:
+    wire = start + share[:, None] * np.subtract(end, start)
+    strands = bonds.positions[:, None] - share[:, None] * bonds.stretch[:, None]
+    found = [cKDTree(wire).query(strand)[0].min() for strand in strands]
+    np.testing.assert_allclose(bonds.distance(start, end), found, atol=1e-4)
 
 
 # What is refused.

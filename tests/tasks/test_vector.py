@@ -12,7 +12,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
 from palpate.tasks import registry  # noqa: E402
 from palpate.tasks.core import performer  # noqa: E402
 
-# float32 of the batch against float64; jaws on a fold of tissue magnify it.
+# float32 of the batch against float64, of either hand; jaws on a fold of tissue magnify it.
 LIMITS = {"contact_force": 0.02, "shaft_force": 0.02, "peak_force": 0.02, "gripper": 0.1}
 LIMITS |= {"joint_vel": 5e-3, "traction": 0.02}
 ENDING = "touch/easy", "trace/easy", "grasp/easy", "retract/easy", "dissect/easy"
@@ -66,7 +66,8 @@ def distances(name, values):
 def compare(seen, expected):
   for name, values in expected.items():
     a, b = (distances(name, np.asarray(v)) for v in (seen[name], values))
-    np.testing.assert_allclose(a, b, atol=LIMITS.get(name, 2e-4), err_msg=name)
+    limit = LIMITS.get(name.removeprefix("hook_"), 2e-4)
+    np.testing.assert_allclose(a, b, atol=limit, err_msg=name)
 
 
 def compare_metrics(told, k, expected):
@@ -90,7 +91,7 @@ def compare_metrics(told, k, expected):
     ("retract/easy", 1, 157, {"hold": 0.1, "wanted": 0.1}),
     ("dissect/easy", 1, 245, {"wanted": 0.2}),
     ("tease/easy", 1, 76, {}),
-    ("bimanual/easy", 1, 213, {"wanted": 0.03}),
+    ("bimanual/easy", 1, 230, {"wanted": 0.03}),
     ("cut/easy", 1, 260, {"radius": 0.006}),
   ],
 )

@@ -1,4 +1,4 @@
-// Distance of a point to the geoms that windows follow.
+// Distance of a point to the geoms that windows follow, and of two segments.
 #pragma once
 #include "core/d3.h"
 
@@ -62,6 +62,20 @@ PALPATE double nearest(const double* geom, int ngeom, D3 x) {
     best = at < best ? at : best;
   }
   return best;
+}
+
+PALPATE double to_share(double x) { return x < 0.0 ? 0.0 : x > 1.0 ? 1.0 : x; }
+
+// The distance of the segment from p along d to the one from q along e, which may be a point (Ericson
+// 2005, Real-Time Collision Detection, 5.1.9).
+PALPATE double between(D3 p, D3 d, D3 q, D3 e) {
+  const D3 r = p - q;
+  const double dd = dot(d, d), ee = dot(e, e), de = dot(d, e), dr = dot(d, r), er = dot(e, r);
+  const double apart = dd * ee - de * de;  // 0 where they are parallel
+  double s = apart > 1e-6 * dd * ee ? to_share((de * er - dr * ee) / apart) : 0.0;
+  const double t = ee > 0.0 ? to_share((de * s + er) / ee) : 0.0;
+  s = dd > 0.0 ? to_share((de * t - dr) / dd) : 0.0;
+  return norm(r + s * d - t * e);
 }
 
 // Whether a geom comes within `reach` of a box: its bounding sphere, or a plane itself.

@@ -201,7 +201,8 @@ PALPATE void keep_bonds(const Fields& all, Thread t, int) {
   });
 }
 
-// Weakens the bonds that are near the axis of a geom with a current by what it gives in a step.
+// Weakens the bonds whose strands, from bed to vertex, come within reach of the axis of a geom with a
+// current, by what it gives in a step.
 template <class Fields>
 PALPATE void burn_bonds(const Fields& all, Thread t, int) {
   if (!all.bonds.live.data[0] || t.tid > 0) return;
@@ -210,12 +211,12 @@ PALPATE void burn_bonds(const Fields& all, Thread t, int) {
   if (given == 0.0) return;
   const auto* R = f.mj.geom_xmat.data + 9 * all.geom;
   const D3 axis = {R[all.axis], R[3 + all.axis], R[6 + all.axis]};
-  const D3 middle = load(f.mj.geom_xpos.data + 3 * all.geom);
+  const D3 end = load(f.mj.geom_xpos.data + 3 * all.geom) - all.half * axis;
   auto near = [&](int n) {
-    const D3 off = place_of(f.mj, f.own, f.vert.data[n]).at - middle;
-    const double along = dot(off, axis), far = all.half;
-    const double end = along > far ? far : along < -far ? -far : along;
-    return f.state.data[2 * f.slot.data[n]] < 1.0 && norm(off - end * axis) < all.reach;
+    const D3 strand = load(f.stretch.data + 3 * n);
+    const D3 bed = place_of(f.mj, f.own, f.vert.data[n]).at - strand;
+    return f.state.data[2 * f.slot.data[n]] < 1.0 &&
+           between(end, 2.0 * all.half * axis, bed, strand) < all.reach;
   };
   double area = 0.0;
   for (int n = 0; n < f.count.data[0]; ++n)

@@ -200,15 +200,37 @@ def test_a_current_cuts_as_fast_as_its_power_allows():
     assert bool(organ.cuts) == (length > 0)
 
 
-def test_a_current_frees_bonds():
+@pytest.mark.parametrize("gap", [0.0002, 0.0005])  # [m]
+def test_a_current_frees_bonds_where_it_touches_or_a_spark_leaps(gap):
+  skin, wire = 0.0003, 0.001  # [m]
   model, data, organ = scene(
-    add=current, x=0.025, spare=0, bonds="none", cutters="edge 1e6 by power"
+    add=current, x=0.0, spare=0, radius=skin, bonds="none", cutters="edge 1e6 by power"
   )
   mujoco.mj_forward(model, data)
   vertices = np.flatnonzero(organ.free)
+  under = vertices[np.abs(organ.xpos[vertices, 1]).argmin()]
+  x, y, _ = organ.xpos[under]
+  place = data.qpos[:2] = x, 0.001 + np.sqrt((wire + skin + gap) ** 2 - y**2)
   organ.bond("world", 1e7, 6e3, 6.0, vertices=vertices)
-  near = np.linalg.norm(organ.bonds.positions - [0.025, 0, 0], axis=1) < 0.002
-  assert near.any()
+  scenes.follow(model, data, organ, lambda t: (*place, -80.0), 0.4)
+  free = organ.bonds.vertices[organ.bonds.free]
+  assert free.tolist() == ([under] if gap < 0.0003 else [])
+
+
+def test_a_current_frees_a_bond_by_its_strand():
+  def add(spec, x, z):
+    current(spec, x, z)
+    spec.worldbody.add_body(name="bed", mocap=True)
+
+  model, data, organ = scene(
+    add=add, x=0.025, z=-0.0045, spare=0, bonds="none", cutters="edge 1e6 by power"
+  )
+  mujoco.mj_forward(model, data)
+  organ.bond("bed", 1e5, 6e3, 400.0, vertices=np.flatnonzero(organ.free))
+  near = np.linalg.norm(organ.bonds.positions[:, :2] - [0.025, 0], axis=1) < 0.002
+  scenes.follow(model, data, organ, lambda t: (0, 0, -80.0), 0.2)
+  assert near.any() and not organ.bonds.damage.any()  # it is 3.5 mm below the vertices
+  data.mocap_pos[0, 2] = -0.005
   scenes.follow(model, data, organ, lambda t: (0, 0, -80.0), 0.4)
   assert organ.bonds.free[near].all() and not organ.bonds.free[~near].any()
 
