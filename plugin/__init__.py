@@ -16,22 +16,26 @@ if TYPE_CHECKING:
   from .organ import Organ
   from .skins import add_skin
   from .spares import add_spare
+  from .thread import Thread, add_thread
   from .windows import add_windows
 
 __all__ = [
   "Organ",
+  "Thread",
   "__version__",
   "add_organ",
   "add_skin",
   "add_spare",
+  "add_thread",
   "add_windows",
   "register",
 ]
 __version__ = "0.2.0"
-# Modules of what `register` brings.
+# Modules of what `register` brings, and of what comes when it is asked for.
 _BROUGHT = {
   "Organ": "organ", "add_skin": "skins", "add_spare": "spares", "add_windows": "windows",
 }  # fmt: skip
+_LATER = {"add_organ": "authoring", "add_thread": "thread", "Thread": "thread"}
 
 
 def register() -> int:
@@ -56,15 +60,13 @@ def register() -> int:
 
 
 def __getattr__(name: str):
-  """Brings what is asked for first: `add_organ`, with what reads meshes, and in the command all."""
+  """Brings what is asked for first: what writes scenes, and in the command all."""
   if name in _BROUGHT:
     register()
     return globals()[name]
-  if name != "add_organ":
+  if name not in _LATER:
     raise AttributeError(f"module 'palpate' has no attribute {name!r}")
-  from .authoring import add_organ
-
-  return add_organ
+  return getattr(_importlib.import_module(f".{_LATER[name]}", __name__), name)
 
 
 def _is_command() -> bool:

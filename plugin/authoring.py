@@ -76,12 +76,12 @@ def add_organ(
   _, vertices, triangles = meshes.read(mesh, scale, sized=not isinstance(mesh, tuple | list))
   bare = _surface(name, *meshes.merge(vertices, triangles))
   surface = spares.with_spare(name, bare, spare, config)
-  pins, mass = _pins(name, pin, surface), _mass(name, mass, surface)
+  pins, mass = pinned(name, pin, bare.nvert), _mass(name, mass, surface)
   windowed, options = windows is not False, _windows(name, windows)
   texts = _texts(name, config, surface, mass if windowed else None)
-  look = _look(name, radius, rgba) | _contact(name, {**CONTACT, **(contact or {})})
-  where = _parent(spec, name, parent)
-  _check_names(spec, name, 0 if windowed else surface.nvert)
+  look = look_of(name, radius, rgba) | contact_of(name, {**CONTACT, **(contact or {})})
+  where = parent_of(spec, name, parent)
+  check_names(spec, name, 0 if windowed else surface.nvert)
   body = where.add_body(name=name, pos=pos, quat=quat)
   texts |= spares.add_walls(spec, body, name, surface, config, radius)
   if windowed:
@@ -91,15 +91,28 @@ def add_organ(
 
 def _add_nodal(spec, body, surface: topology.Mesh, pins, mass: float, texts: dict, look: dict):
   """Adds plugin, nodes and flex of an organ whose nodes are MuJoCo's; returns the flex."""
-  _instance(spec, body.name, texts)
-  points, bodies = surface.rest.copy(), [body.name] * surface.nvert
   share = mass / (surface.nvert - surface.spare)
-  for k in np.setdiff1d(np.arange(surface.nvert), pins):
+  return author.make_flex(
+    spec, body.name, *add_nodes(spec, body, surface.rest, pins, share, texts), surface.elem, **look
+  )
+
+
+def add_nodes(
+  spec, body, points: np.ndarray, pins: np.ndarray, mass: float, texts: dict[str, str]
+) -> tuple[np.ndarray, list[str]]:
+  """Adds a plugin instance and the nodes whose motion is MuJoCo's, each of a mass [kg].
+
+  Returns:
+    the vertices in their bodies [m] (n, 3), and these
+  """
+  _instance(spec, body.name, texts)
+  points, bodies = points.copy(), [body.name] * len(points)
+  for k in np.setdiff1d(np.arange(len(points)), pins):
     bodies[k] = f"{body.name}_{k}"
-    node = author.add_node(body, bodies[k], points[k], share, 2 / 3 * share * _BOX**2)
+    node = author.add_node(body, bodies[k], points[k], mass, 2 / 3 * mass * _BOX**2)
     _own(node, body.name)
     points[k] = 0.0
-  return author.make_flex(spec, body.name, points, bodies, surface.elem, **look)
+  return points, bodies
 
 
 def _add_windowed(spec, body, surface: topology.Mesh, pins, mass: float, texts, look, options):
@@ -137,8 +150,8 @@ def _surface(name: str, vertices: np.ndarray, triangles: np.ndarray) -> topology
   return made
 
 
-def _pins(name: str, pin: Sequence[int], surface: topology.Mesh) -> np.ndarray:
-  nvert = surface.nvert - surface.spare
+def pinned(name: str, pin: Sequence[int], nvert: int) -> np.ndarray:
+  """Returns the vertices that do not move, of `nvert`; raises ValueError for others."""
   pins = np.unique(np.asarray(pin, dtype=float))
   bad = pins[(pins != np.floor(pins)) | (pins < 0) | (pins >= nvert)]
   if bad.size:
@@ -179,7 +192,8 @@ def _windows(name: str, windows: bool | Mapping[str, object]) -> dict:
   return options
 
 
-def _look(name: str, radius: float, rgba) -> dict:
+def look_of(name: str, radius: float, rgba) -> dict:
+  """Returns a flex's attributes of its look; raises ValueError for a wrong one."""
   if not (np.isfinite(radius) and radius > 0):
     raise ValueError(f"organ {name!r}: radius is {radius}, expected a number > 0")
   if rgba is None:
@@ -189,7 +203,7 @@ def _look(name: str, radius: float, rgba) -> dict:
   return {"radius": radius, "rgba": np.asarray(rgba, dtype=float)}
 
 
-def _contact(name: str, given: dict) -> dict:
+def contact_of(name: str, given: dict) -> dict:
   """Returns a flex's attributes for those of <contact>."""
   made: dict = {}
   for key, value in given.items():
@@ -209,7 +223,7 @@ def _contact(name: str, given: dict) -> dict:
   return made
 
 
-def _parent(spec, name: str, parent):
+def parent_of(spec, name: str, parent):
   """Returns the body that an organ is put in."""
   if parent is None:
     return spec.worldbody
@@ -225,7 +239,8 @@ def _parent(spec, name: str, parent):
   return found
 
 
-def _check_names(spec, name: str, nodes: int):
+def check_names(spec, name: str, nodes: int):
+  """Raises ValueError where the spec has the name of an organ or of its nodes already."""
   if not name:
     raise ValueError("name is '', expected the organ's")
   taken = {body.name for body in spec.bodies}

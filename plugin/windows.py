@@ -290,20 +290,20 @@ def add_node(parent, name: str, pos: np.ndarray, mass: float, inertia: float):
 
 
 def make_flex(spec, name: str, points: np.ndarray, bodies: list[str], elem: np.ndarray, **look):
-  """Adds a flex of triangles and returns it.
+  """Adds a flex of triangles, or of edges, and returns it.
 
   Args:
     spec: changed in place
     name: of the flex
     points: vertices in their bodies [m]  (n, 3)
     bodies: of the vertices
-    elem: triangles                       (m, 3)
+    elem: triangles                       (m, 3), or edges (m, 2)
     **look: further attributes
   """
   # A flex without forces of its own makes MuJoCo warn; the plugin sets its damping to 0.
   return spec.add_flex(
     name=name,
-    dim=2,
+    dim=elem.shape[1] - 1,
     vert=points.ravel(),
     vertbody=bodies,
     elem=elem.ravel(),

@@ -117,10 +117,8 @@ def _offsets(prefix: str, kind, names) -> dict[str, int]:
   return {f"{prefix}_{name.upper()}": getattr(kind, name).offset for name in names}
 
 
-weigh = kernel(
-  "weigh",
-  "coupling/contact_weights.h",
-  Weights,
+# What native code knows of contacts and their rows.
+CONSTANTS = (
   coupling.CONSTANTS
   | TISSUE.constants()
   | _offsets("DATA", mjstruct.Data, _DATA)
@@ -133,6 +131,8 @@ weigh = kernel(
     "SUNK": SUNK,
     **FLAT,
     "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
+    "IS_EQUALITY": int(mujoco.mjtConstraint.mjCNSTR_EQUALITY),
+    "IS_LIMIT": int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT),
     "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
     "CONTACT_ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
     "JACOBIAN_DENSE": int(mujoco.mjtJacobian.mjJAC_DENSE),
@@ -141,8 +141,9 @@ weigh = kernel(
     "INTEGRATOR_DISCRETE": int(getattr(mujoco.mjtIntegrator, "mjINT_DISCRETE", -1)),
     "SOLVER_PGS": int(mujoco.mjtSolver.mjSOL_PGS),
     "ENABLE_DIAGEXACT": int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
-  },
+  }
 )
+weigh = kernel("weigh", "coupling/contact_weights.h", Weights, CONSTANTS)
 
 
 @functools.cache

@@ -257,6 +257,14 @@ class WindowState:
 
 
 @struct
+class RodState:
+  """Plugin state of a thread, see `rods`."""
+
+  twist: doubles("nvert")  # twist at each node between two edges, 0 at the ends [rad]
+  signature: doubles(1)  # of the thread; 0 where it was set by hand [-]
+
+
+@struct
 class Inbox:
   """What a windowed organ's nodes are told."""
 

@@ -17,10 +17,10 @@ import numpy as np
 from palpate.tissue.config import KEYS
 
 from ..forces.passive import Force
-from . import change, contacts, signals, workspace
+from . import change, contacts, rods, signals, workspace
 from .cutting import cuts
 from .layout import FLAG
-from .model import mjstruct, skin, state_size
+from .model import declare, mjstruct, skin, state_size
 from .model.mjstruct import NAME, warn
 from .windows import windowed
 from .workspace import Workspace
@@ -66,13 +66,23 @@ class _Plugin(C.Structure):
   )
 
 
-_workspaces: dict[tuple[int, int], Workspace] = {}  # by address of the mjData and plugin instance
-_states: dict[int, Workspace] = {}  # by address of the organ's numbers in mjData.plugin_state
+# By address of the mjData and plugin instance.
+_workspaces: dict[tuple[int, int], Workspace | rods.Workspace] = {}
+_states: dict[int, Workspace | rods.Workspace] = {}  # by that of its numbers in plugin_state
 
 
 def find(data: int, instance: int) -> Workspace:
   """Returns the workspace of plugin instance `instance` in the mjData at address `data`."""
-  return _workspaces[data, instance]
+  found = _workspaces[data, instance]
+  assert isinstance(found, Workspace)
+  return found
+
+
+def find_thread(data: int, instance: int) -> rods.Workspace:
+  """Returns the thread of plugin instance `instance` in the mjData at address `data`."""
+  found = _workspaces[data, instance]
+  assert isinstance(found, rods.Workspace)
+  return found
 
 
 def count() -> int:
@@ -84,7 +94,7 @@ def count() -> int:
 
 def _windowed(model: mujoco.MjModel, data: mujoco.MjData) -> list[Workspace]:
   found = [_workspaces.get((data._address, i)) for i in range(model.nplugin)]
-  return [w for w in found if w is not None and w.turn is not None]
+  return [w for w in found if isinstance(w, Workspace) and w.turn is not None]
 
 
 def sync(model: mujoco.MjModel, data: mujoco.MjData):
@@ -114,11 +124,13 @@ def _nstate(model: int, instance: int) -> int:
 @signals.watch
 def _init(model: int, data: int, instance: int) -> int:
   try:
-    w = workspace.make(model, data, instance)
+    made = rods if declare.is_rod(model, instance) else workspace
+    w = made.make(model, data, instance)
     _workspaces[data, instance] = _states[w.plugin_state.ctypes.data] = w
-    mine = [each for (of, _), each in _workspaces.items() if of == data]
-    for each in workspace.join(mine):
-      workspace.rebind(each)
+    if isinstance(w, Workspace):
+      mine = [each for (of, _), each in _workspaces.items() if of == data]
+      for each in workspace.join([each for each in mine if isinstance(each, Workspace)]):
+        workspace.rebind(each)
     return 0
   except BaseException as error:
     _say(error)
@@ -135,9 +147,10 @@ def _destroy(data: int, instance: int):
 
 @signals.watch
 def _copy(data: int, model: int, source: int, instance: int):
-  w = _workspaces[data, instance]
+  w, other = _workspaces[data, instance], _workspaces[source, instance]
   try:
-    change.copy(w, model, _workspaces[source, instance], functools.partial(_twin, data))
+    if isinstance(w, Workspace) and isinstance(other, Workspace):
+      change.copy(w, model, other, functools.partial(_twin, data))
   except BaseException as error:
     _fail(w, error)
   return signals.leave()
@@ -145,7 +158,7 @@ def _copy(data: int, model: int, source: int, instance: int):
 
 def _twin(data: int, force: Force) -> tuple[Workspace, Force]:
   """Returns the workspace and the force of an mjData for a force of another one."""
-  w = _workspaces[data, force.host.instance]
+  w = find(data, force.host.instance)
   return w, w.forces.of(type(force))
 
 
@@ -157,9 +170,10 @@ def _reset(model: int, state: int, unused: int | None, instance: int):
   w = _states.get(state)  # mjData.plugin_data, the other argument, is copied by pickle
   if w is not None:
     w.forget()
+    w.report.nbad = 0
+  if isinstance(w, Workspace):
     w.attachments.put([group for group in w.attachments.groups if group.by])
     w.bonds.let_go()
-    w.report.nbad = 0
   return signals.leave()
 
 
@@ -173,15 +187,18 @@ def _compute(model: int, data: int, instance: int, capability: int):
   return signals.leave()
 
 
-def _push(w: Workspace, model: int):
+def _push(w: Workspace | rods.Workspace, model: int):
   """Adds the passive force."""
   signals.enter()
-  if not w.seen.identity.is_of(model):
+  if isinstance(w, rods.Workspace):
+    if not w.seen.identity.is_of(model):
+      w.bind(model)
+  else:
     workspace.attach(w, model)
   if _count_bad(w) > w.report.nbad:
     _find_bad_state(w)
   w.run()
-  if w.seen.status[3]:
+  if isinstance(w, Workspace) and w.seen.status[3]:
     w.note(f"the {w.config.integrator} step has no finite solution: the motion diverged")
 
 
@@ -195,9 +212,11 @@ def _advance(model: int, data: int, instance: int):
   return signals.leave()
 
 
-def _end(w: Workspace):
+def _end(w: Workspace | rods.Workspace):
   """Ends the step, and looks at what came of it."""
   w.step()
+  if isinstance(w, rods.Workspace):
+    return
   if w.cuts:
     w.cuts.hide(w.model)
   if any(each and each.open(cuts.Opening(w)) for each in w.opens):
@@ -217,19 +236,24 @@ def _end(w: Workspace):
 def _visualize(model: int, data: int, option: int, scene: int, instance: int):
   w = _workspaces[data, instance]
   try:
-    if w.cuts:
-      cuts.follow(w)
-      with w.cuts.lock:
-        w.cuts.show()
-    if w.organ.windows:
-      windowed.draw(w, model, data)
-    if w.cuts:
-      w.cuts.draw(w.organ, w.motion()[0], model, data)
-    if w.skin is not None:
-      _draw_skin(w, model, data)
+    if isinstance(w, Workspace):
+      _draw(w, model, data)
   except BaseException as error:
     _fail(w, error)
   return signals.leave()
+
+
+def _draw(w: Workspace, model: int, data: int):
+  if w.cuts:
+    cuts.follow(w)
+    with w.cuts.lock:
+      w.cuts.show()
+  if w.organ.windows:
+    windowed.draw(w, model, data)
+  if w.cuts:
+    w.cuts.draw(w.organ, w.motion()[0], model, data)
+  if w.skin is not None:
+    _draw_skin(w, model, data)
 
 
 def _draw_skin(w: Workspace, model: int, data: int):
@@ -243,12 +267,12 @@ def _draw_skin(w: Workspace, model: int, data: int):
 # What went wrong.
 
 
-def _count_bad(w: Workspace) -> int:
+def _count_bad(w: Workspace | rods.Workspace) -> int:
   warned = w.seen.warning  # last index and count of each
   return warned[2 * _BAD[0] + 1] + warned[2 * _BAD[1] + 1] + warned[2 * _BAD[2] + 1]
 
 
-def _find_bad_state(w: Workspace):
+def _find_bad_state(w: Workspace | rods.Workspace):
   """Makes an error of what MuJoCo warned of, and has reset since, if it is in this organ's dofs."""
   w.report.nbad = _count_bad(w)
   organ = w.organ
@@ -266,7 +290,7 @@ def _say(error: BaseException):
   warn(str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}")
 
 
-def _fail(w: Workspace, error: BaseException):
+def _fail(w: Workspace | rods.Workspace, error: BaseException):
   """Makes an error of an exception in a callback, whose step is not whole."""
   if isinstance(error, Exception):
     w.note(f"{type(error).__name__}: {error}")
@@ -274,7 +298,7 @@ def _fail(w: Workspace, error: BaseException):
     _interrupt(w, error)
 
 
-def _interrupt(w: Workspace | None, error: BaseException):
+def _interrupt(w: Workspace | rods.Workspace | None, error: BaseException):
   """Makes an error of what a signal's handler raised, and raises that after the callback."""
   signals.raise_later(error)
   if w is not None:

@@ -475,9 +475,9 @@ def make(model: int, data: int, instance: int) -> Workspace:
 
 def _view(w: Workspace, d: mjstruct.Struct, m: mjstruct.Struct):
   """Takes views of an mjData that every step looks at."""
-  fields, count = mjstruct.Data, len(d.warning)
+  fields = mjstruct.Data
   w.seen.status = w.host.arrays["status"].numpy()[0].data
-  w.seen.warning = mjstruct.view(w.data + fields.warning.offset, 2 * count, np.int32).data
+  w.seen.warning = mjstruct.warnings(w.data)
   w.seen.nefc = mjstruct.view(w.data + fields.nefc.offset, 1, np.int32).data
   if w.turn is not None:
     first, last = int(w.organ.qposs.min()), int(w.organ.qposs.max()) + 1

@@ -52,9 +52,10 @@ class Config:
 
   elements: str = _row(
     "membrane",
-    reading.words("membrane", "spring", "solid"),
-    "`membrane` (St. Venant-Kirchhoff triangles, plane stress), `spring` (edge springs) or `solid` "
-    "(neo-Hookean tetrahedra inside, made when the model is compiled)",
+    reading.words("membrane", "spring", "solid", "rod"),
+    "`membrane` (St. Venant-Kirchhoff triangles, plane stress), `spring` (edge springs), `solid` "
+    "(neo-Hookean tetrahedra inside, made when the model is compiled) or `rod` (a thread, of a "
+    "flexcomp of dim 1)",
   )
   tetrahedra: str = _row(
     "",
@@ -91,7 +92,14 @@ class Config:
   bend: float = _row(
     1.0,
     reading.NOT_NEGATIVE,
-    "factor on the plate's rigidity E t^3 / (12 (1 - nu^2)); 0 switches bending off",
+    "factor on the plate's rigidity E t^3 / (12 (1 - nu^2)), or on a rod's, E I; 0 switches "
+    "bending off",
+  )
+  twist: float = _row(
+    1.0,
+    reading.NOT_NEGATIVE,
+    "factor on a rod's rigidity against twisting, G J, G = E / (2 (1 + nu)); 0 switches it off; "
+    'with `elements="rod"` alone',
   )
   foundation: float = _row(
     0.0,
@@ -131,7 +139,10 @@ class Config:
     change=GRAPH,
   )
   iterations: int = _row(
-    200, reading.whole(1, 10000), "most PCG iterations of a solve", change=NUMBER
+    200,
+    reading.whole(1, 10000),
+    "most PCG iterations of a solve, or Newton iterations of a rod's step",
+    change=NUMBER,
   )
   tolerance: float = _row(
     1e-4, reading.number(1e-10, 1.0), "relative residual at which PCG stops", change=NUMBER
@@ -252,6 +263,7 @@ ROWS: dict[str, Row] = {each.name: each.metadata["row"] for each in dataclasses.
 KEYS = tuple(ROWS)
 RUNNING = tuple(key for key, row in ROWS.items() if row.change)
 MATERIAL = tuple(key for key, row in ROWS.items() if row.change == TISSUE)
+ROD = ("elements", "young", "poisson", "bend", "twist", "iterations")  # all that a rod may have
 RECORDED = tuple(key for key, row in ROWS.items() if row.change == GRAPH)
 
 
@@ -369,6 +381,14 @@ def _value(organ: str, key: str, text: str, read: Callable, allowed: str, nelem:
 
 
 def _check_combination(organ: str, config: Config, given: dict, closed: bool):
+  if config.elements == "rod":
+    for key in given:
+      if key not in ROD:
+        raise ValueError(
+          f"organ {organ!r}: {key} is set and elements is 'rod', expected {', '.join(ROD)}"
+        )
+  elif "twist" in given:
+    raise ValueError(f"organ {organ!r}: twist is set, allowed only with elements='rod'")
   spring = config.elements == "spring"
   if spring and "stiffness" not in given:
     raise ValueError(f"organ {organ!r}: elements is 'spring' and stiffness is missing [N/m]")

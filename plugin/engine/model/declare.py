@@ -165,22 +165,12 @@ def read(model: int, instance: int) -> Declaration:
   """
   devices.init()
   m = mjstruct.Model.from_address(model)
-  flex = _flex_of(m, instance)
+  flex = flex_of(m, instance)
   name = flexes.name(m, flex)
+  check_surface(m, flex, name)
   check_flex(m, flex, name)
-  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex]
-  nvert = flexes.vertices(m, flex)
-  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + nvert].copy()
-  local = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + nvert]
-  free = np.isin(body, moving_bodies(m, instance))
-  if not free.any():
-    raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
-  parent = find_parent(m, name, body, free)
-  frame, origin = static_frame(m, name, parent)
-  turn = find_turn(m, name, body[free])
-  frame = frame @ turn
-  rest = np.where(free[:, None], mjstruct.view(m.body_pos, (m.nbody, 3))[body] @ turn, 0.0)
-  rest += np.where(free[:, None], local, local @ turn)
+  body, rest, free, frame, origin = places(m, instance, flex, name)
+  nvert, parent = len(rest), find_parent(m, name, body, free)
   config, mesh = read_mesh(m, name, keys(model, instance), rest, flex)
   check_volume(name, mesh, config)
   if config.carrier and not free.all():
@@ -211,6 +201,38 @@ def read(model: int, instance: int) -> Declaration:
     origin=origin,
     mass=mass,
   )
+
+
+def places(
+  m, instance: int, flex: int, name: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+  """Returns where the vertices of a flex with dofs are.
+
+  Returns:
+    body of each vertex (nvert,); rest positions in the slides' axes [m] (nvert, 3); whether it
+    moves (nvert,); rotation from these axes to the world (3, 3); position of the parent body [m]
+
+  Raises:
+    ValueError: no vertex moves, or they have no parent body that stands still.
+  """
+  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex]
+  nvert = flexes.vertices(m, flex)
+  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + nvert].copy()
+  local = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + nvert]
+  free = np.isin(body, moving_bodies(m, instance))
+  if not free.any():
+    raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
+  parent = find_parent(m, name, body, free)
+  frame, origin = static_frame(m, name, parent)
+  turn = find_turn(m, name, body[free])
+  rest = np.where(free[:, None], mjstruct.view(m.body_pos, (m.nbody, 3))[body] @ turn, 0.0)
+  rest += np.where(free[:, None], local, local @ turn)
+  return body, rest, free, frame @ turn, origin
+
+
+def is_rod(model: int, instance: int) -> bool:
+  """Returns whether a plugin instance is a thread's, see `rods`."""
+  return mjstruct.config(model, instance, "elements").strip() == "rod"
 
 
 def read_mesh(
@@ -289,7 +311,8 @@ def moving_bodies(m, instance: int) -> np.ndarray:
   return np.setdiff1d(bodies, mjstruct.view(m.body_parentid, m.nbody, np.int32)[bodies])
 
 
-def _flex_of(m, instance: int) -> int:
+def flex_of(m, instance: int) -> int:
+  """Returns the flex whose vertices a plugin instance owns."""
   owner = mjstruct.view(m.body_plugin, m.nbody, np.int32)
   bodies = moving_bodies(m, instance)
   if not bodies.size:
@@ -316,13 +339,17 @@ def check_surface(m, flex: int, name: str):
   dim = mjstruct.view(m.flex_dim, m.nflex, np.int32)[flex]
   if dim != 2:
     raise ValueError(f"organ {name!r}: flexcomp dim is {dim}, expected dim='2' (a surface)")
+  check_integrator(m, name)
+
+
+def check_integrator(m, name: str):
+  """Raises ValueError where MuJoCo's integrator is none that a step can be part of."""
   if m.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
     raise ValueError(f"organ {name!r}: {NO_RK4}")
 
 
 def check_flex(m, flex: int, name: str):
-  """Raises ValueError where a flex cannot give MuJoCo's dofs to an organ."""
-  check_surface(m, flex, name)
+  """Raises ValueError where a flex cannot give MuJoCo's dofs to an organ or a thread."""
   if mjstruct.view(m.flex_rigid, m.nflex, np.bool_)[flex]:
     raise ValueError(
       f"organ {name!r}: flexcomp is rigid (or all its vertices are pinned), expected rigid='false'"

@@ -53,11 +53,12 @@ def elements(m, flex: int) -> np.ndarray:
   return element_data(m, flex).copy()
 
 
-def element_data(m, flex: int) -> np.ndarray:
-  """Returns MuJoCo's own memory of the triangles of a flex, (nelem, 3)."""
+def element_data(m, flex: int, corners: int = 3) -> np.ndarray:
+  """Returns MuJoCo's own memory of the triangles of a flex, or edges, (nelem, corners)."""
   adr = int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[flex])
   num = _extent(m.flex_elemadr, m.nflex, m.nflexelem, flex)
-  return mjstruct.view(m.flex_elem, m.nflexelemdata, np.int32)[adr : adr + 3 * num].reshape(num, 3)
+  elem = mjstruct.view(m.flex_elem, m.nflexelemdata, np.int32)
+  return elem[adr : adr + corners * num].reshape(num, corners)
 
 
 def rim_data(m, flex: int, count: int) -> np.ndarray:

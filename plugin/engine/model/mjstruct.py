@@ -129,6 +129,12 @@ def error_text(message: int) -> str | None:
   return f"{found.func.decode()}: {text}" if found.func else text
 
 
+def warnings(data: int) -> memoryview:
+  """Returns last index and count of each of the warnings of the mjData at an address, in turn."""
+  count = len(Data.from_address(data).warning)
+  return view(data + Data.warning.offset, 2 * count, np.int32).data
+
+
 class Identity:
   """Tells an mjModel from others that take its address when it is freed.
 

@@ -18,6 +18,8 @@ from . import inertia, mjstruct
 from .declare import Declaration
 
 _KNOWN = 64
+_FIRM = 0.1  # inertia by which contacts with a thread are as firm as they are [kg]
+_AHEAD = 2.0  # radii from a thread within which there are contacts
 _PARTS = 8  # that cuts may make of a node
 _made_for: dict[bytes, tuple] = {}  # digest of an armature of ours -> time step and material
 
@@ -38,6 +40,20 @@ def fit(m: mjstruct.Struct, organ: Declaration, body: Body):
   mass = mjstruct.view(m.body_mass, m.nbody)
   light = win.mass[win.mass > 0].min() / (_PARTS if organ.mesh.spare else 1)
   mass[win.body] = np.minimum(mass[win.body], light)
+
+
+def fit_thread(m: mjstruct.Struct, flex: int, body: np.ndarray):
+  """Makes a model fit a thread, whose moving vertices have these bodies.
+
+  The inertia of its nodes is that of each step. Contacts would be soft by their masses, of a
+  microgram.
+  """
+  mjstruct.view(m.flex_edgedamping, m.nflex)[flex] = 0.0
+  margin = mjstruct.view(m.flex_margin, m.nflex)
+  margin[flex] = max(margin[flex], _AHEAD * mjstruct.view(m.flex_radius, m.nflex)[flex])
+  dof = mjstruct.view(m.body_dofadr, m.nbody, np.int32)[body][:, None] + np.arange(3)
+  mjstruct.view(m.body_invweight0, (m.nbody, 2))[body, 0] = 1 / _FIRM
+  mjstruct.view(m.dof_invweight0, m.nv)[dof] = 1 / _FIRM
 
 
 def give_armature(m: mjstruct.Struct, organ: Declaration, body: Body, config: Config):

@@ -5,13 +5,15 @@ from __future__ import annotations
 from palpate.tissue.geometry import fill
 
 from .. import coupling, layout
-from ..layout import NodalState, WindowState
+from ..layout import NodalState, RodState, WindowState
 from . import declare, mjstruct
 
 
 def state_size(model: int, instance: int) -> int:
   """Returns the length of the plugin state: at least what `coupling.sizes` will ask for."""
   m = mjstruct.Model.from_address(model)
+  if declare.is_rod(model, instance):
+    return layout.size(RodState, {"nvert": m.nflexvert})
   relaxes, rests, bonded = (
     bool(mjstruct.config(model, instance, key).strip())
     for key in ("relax_share", "support", "bonds")

@@ -115,35 +115,6 @@ PALPATE void weigh_side(const Fields& f, char* contact, Rows rows, int side) {
   if (from > 0.0 && to > 0.0) scale_impedance(f, rows, to / from);
 }
 
-// How fast MuJoCo brakes what slides at a contact, times friction [m/s^2]: with D the damping of a
-// row, |D mu v| over the directions in the contact's plane. The rows of a pyramid, n + mu t and
-// n - mu t, part by less where they share it.
-template <class Fields>
-PALPATE double parting(const Fields& f, const char* contact, Rows rows) {
-  const double* friction = (const double*)(contact + CONTACT_FRICTION);
-  double sum = 0.0;
-  for (int r = rows.first + !rows.paired; r < rows.first + rows.count; r += 1 + rows.paired) {
-    const double damping = datum<double*>(f, DATA_EFC_KBIP)[4 * r + 1];
-    const double v = rows.paired ? 0.5 * (velocity(f, r) - velocity(f, r + 1))
-                                 : friction[r - rows.first - 1] * velocity(f, r);
-    sum += damping * v * damping * v;
-  }
-  return sqrt(sum);
-}
-
-// Moves the contact's gap by what lies off it, and by as much as takes that parting away: sliding then
-// has the gap, and the force, of standing (de Saxce and Feng 1998, doi:10.1016/S0895-7177(98)00119-8,
-// with the velocity that the step begins with). Done twice it does nothing.
-template <class Fields>
-PALPATE void keep_closed(const Fields& f, const char* contact, Rows rows, double off) {
-  const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
-  const double stiffness = row[0] * row[2];
-  if (!(stiffness > 0.0)) return;
-  double gap = *(const double*)(contact + CONTACT_DIST) + off;
-  if (rows.count > 1) gap += parting(f, contact, rows) / stiffness;
-  for (int r = 0; r < rows.normals().count; ++r) datum<double*>(f, DATA_EFC_POS)[rows.first + r] = gap;
-}
-
 // The normal of the triangle on a side of a contact, outward.
 template <class Fields>
 PALPATE D3 outward(const Fields& f, const char* contact, int side) {

@@ -1,0 +1,307 @@
+"""Threads: rods whose nodes are MuJoCo's degrees of freedom, and what each needs in an mjData.
+
+A flex of dim 1 with `elements="rod"` is a thread. It has a step (`solver/rod_step.h`) and a
+coupling (`coupling/rod.h`) of its own, in doubles on the CPU.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import dataclasses
+import functools
+import zlib
+
+import numpy as np
+import warp as wp
+from palpate.tissue import config as configuration
+from palpate.tissue import device as devices
+from palpate.tissue import rod
+from palpate.tissue.config import Config
+from palpate.tissue.kernels import kernel
+from palpate.tissue.types import Array, doubles, fill, ints, struct
+
+from . import contacts, coupling, graphs, layout
+from .coupling import Mujoco
+from .layout import RodState
+from .model import declare, flexes, mjstruct, prepare
+from .workspace import Report, Seen
+
+_MOST_ROWS = 48  # of MuJoCo's constraints, for one node
+_MUJOCOS = ("jacobian", "flex_margin", "qvel", "qacc_warmstart")
+_HUGE = 1e6  # more than any twist [rad]
+
+
+@struct
+class Rod:
+  """A rod in MuJoCo's arrays and in the solver's; node i begins edge i."""
+
+  nnode: int  # nodes
+  flex: int  # its flex
+  newton: int  # most iterations of a step
+  twists: int  # whether it resists twisting
+  most_rows: int  # MuJoCo's rows that there is room for
+  shortest: float  # length of its shortest edge [m]
+  length: doubles("nnode")  # rest length of an edge [m]
+  stretch: doubles("nnode")  # E A / length of an edge [N/m]
+  bend: doubles("nnode")  # E I over the length of a node [N m]
+  torsion: doubles("nnode")  # G J over the length of a node [N m]
+  mass: doubles("nnode")  # of a node [kg]
+  spin: doubles("nnode")  # inertia of an edge about itself [kg m^2]
+  held: ints("nunknown")  # whether an unknown does not change
+  rest: doubles("nnode", 3)  # rest position in the slides' axes [m]
+  dofadr: ints("nnode")  # first dof of a node, -1 for pinned ones
+  qposadr: ints("nnode")  # its first number in qpos
+  bodyid: ints("nnode")  # its body
+  massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
+  own_dof: ints("nv")  # number of a dof in the rod: three times the node, and the axis; or -1
+  frame: doubles(3, 3)  # rotation from the slides' axes to the world
+  # A step:
+  start: doubles("nnode", 3)  # place as it begins, in the slides' axes [m]
+  vel: doubles("nnode", 3)  # velocity then [m/s]
+  external: doubles("nnode", 3)  # force besides elasticity and constraints [N]
+  aim: doubles("nnode", 3)  # place where it would end without these [m]
+  place: doubles("nnode", 3)  # place as it ends [m]
+  turn: doubles("nnode")  # turn of an edge about itself in the step [rad]
+  force: doubles("nunknown")  # force of the constraints in the rod's step, negative [N]
+  move: doubles("nunknown")  # change of the unknowns
+  trial: doubles("nunknown")  # scratch
+  gradient: doubles("nunknown")  # of what a step makes least
+  matrix: doubles("nunknown", 11)  # its second derivative, and the factors of that
+  inverse: doubles("nunknown", 11)  # of the matrix without constraints, in the band
+  status: ints(1)  # iterations, or -1: not finite
+  count: ints(1)  # rows of constraints that act on the rod
+  row_kind: ints("nrow")  # see `RowKind`
+  row_node: ints("nrow")  # the first of the two nodes
+  row_value: doubles("nrow", 9)  # J of their dofs; J a of other bodies less aref; D; friction
+  own: RodState
+  mj: Mujoco
+  # MuJoCo's memory under its own names; the mjData itself:
+  nv: int
+  memory: Array(wp.uint64, ("nword",))
+  jacobian: ints(1)
+  flex_margin: doubles("nflex")
+  qvel: doubles("nv")
+  qacc_warmstart: doubles("nv")
+
+
+begin, end = (
+  kernel(name, "coupling/rod.h", Rod, contacts.CONSTANTS) for name in ("begin_rod", "end_rod")
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Declaration:
+  """What is the same in every mjData of a model.
+
+  Attributes:
+    name: name of the flexcomp
+    flex: index of the flex
+    config: configuration
+    radius: of the thread [m]
+    rest: rest positions in the slides' axes [m]  (nvert, 3)
+    free: whether a vertex moves                  (nvert,) bool
+    body: body of each vertex                     (nvert,)
+    dofadr: first dof, -1 if pinned               (nvert,)
+    qposadr: first qpos, -1 if pinned             (nvert,)
+    frame: rotation from the slides' axes to the world (3, 3)
+    origin: position of the parent body [m]       (3,)
+  """
+
+  name: str
+  flex: int
+  config: Config
+  radius: float
+  rest: np.ndarray
+  free: np.ndarray
+  body: np.ndarray
+  dofadr: np.ndarray
+  qposadr: np.ndarray
+  frame: np.ndarray
+  origin: np.ndarray
+
+  @functools.cached_property
+  def signature(self) -> float:
+    """Marks plugin states of this thread; over 2^50."""
+    return float(2**50 + zlib.crc32(self.rest.tobytes() + self.free.tobytes()))
+
+  @property
+  def dofs(self) -> np.ndarray:
+    """Degrees of freedom of the moving vertices."""
+    return (self.dofadr[self.free, None] + np.arange(3)).ravel()
+
+  @property
+  def qposs(self) -> np.ndarray:
+    """Where they are in qpos."""
+    return (self.qposadr[self.free, None] + np.arange(3)).ravel()
+
+  @property
+  def clamped(self) -> np.ndarray:
+    """Edges that neither move nor turn: between two pinned vertices, (nvert - 1,) bool."""
+    return ~(self.free[1:] | self.free[:-1])
+
+
+def read(model: int, instance: int) -> Declaration:
+  """Returns the thread that plugin instance `instance` of an mjModel declares.
+
+  Raises:
+    ValueError: the declaration is not one this plugin can run.
+  """
+  devices.init()
+  m = mjstruct.Model.from_address(model)
+  flex = declare.flex_of(m, instance)
+  name = flexes.name(m, flex)
+  _check(m, flex, name)
+  body, rest, free, frame, origin = declare.places(m, instance, flex, name)
+  edge = flexes.element_data(m, flex, 2)
+  if len(rest) < 2 or not np.array_equal(edge, np.arange(len(rest) - 1)[:, None] + (0, 1)):
+    raise ValueError(
+      f"thread {name!r}: its {len(edge)} edges are not one line through its {len(rest)} vertices "
+      "in their order, expected edges 0 1, 1 2, ... of two vertices or more"
+    )
+  radius = float(mjstruct.view(m.flex_radius, m.nflex)[flex])
+  rod.check_edges(name, np.linalg.norm(np.diff(rest, axis=0), axis=1), radius)
+  texts = declare.keys(model, instance)
+  try:
+    config = configuration.parse(name, texts, len(edge), closed=False)
+  except ValueError as error:
+    raise ValueError(str(error).replace("organ ", "thread ", 1)) from None
+  dofadr, qposadr = declare.addresses(m, name, body, free)
+  return Declaration(
+    name, flex, config, radius, rest, free, body, dofadr, qposadr, frame, origin
+  )
+
+
+def _check(m, flex: int, name: str):
+  """Raises ValueError where a flex cannot be a thread."""
+  dim = mjstruct.view(m.flex_dim, m.nflex, np.int32)[flex]
+  if dim != 1:
+    raise ValueError(
+      f"organ {name!r}: elements is 'rod' and flexcomp dim is {dim}, expected dim='1' (a line)"
+    )
+  declare.check_integrator(m, name)
+  declare.check_flex(m, flex, name)
+  if mjstruct.view(m.flex_selfcollide, m.nflex, np.int32)[flex]:
+    raise ValueError(
+      f"thread {name!r}: selfcollide is set, expected 'none': a thread's contacts with itself are "
+      "not MuJoCo's"
+    )
+
+
+class Workspace:
+  """One thread in one mjData.
+
+  Args:
+    organ: its constants
+    model: address of the mjModel
+    data: address of the mjData
+    instance: number of the plugin instance
+
+  Attributes:
+    fields: what its kernels take
+    constants: those of them that follow from configuration and shape, see `rod.constants`
+    own: its numbers in mjData.plugin_state
+    seen, report: as of an organ
+  """
+
+  def __init__(self, organ: Declaration, model: int, data: int, instance: int):
+    self.organ, self.data, self.instance = organ, data, instance
+    self.seen, self.report = Seen(instance), Report(memoryview(b""))
+    self.bind(model)
+
+  def bind(self, model: int):
+    """Takes the arrays of an mjModel and of the mjData, and records the launches."""
+    m, organ = mjstruct.Model.from_address(model), self.organ
+    n, dofs = len(organ.rest), np.maximum(organ.dofadr, 0)[:, None] + np.arange(3)
+    sizes = {"nvert": n}
+    size = layout.size(RodState, sizes)
+    self.state = coupling.plugin_state(model, self.data, self.instance, size)
+    found = coupling.mujoco_arrays(model, self.data, Rod)
+    own_dof = np.full(m.nv, -1)
+    own_dof[organ.dofs] = (3 * np.flatnonzero(organ.free)[:, None] + np.arange(3)).ravel()
+    held = np.repeat(~organ.free, 4).reshape(n, 4)
+    held[:, 3] = np.append(organ.clamped, True)
+    mass = mjstruct.view(m.body_mass, m.nbody)[organ.body]
+    mass = np.where(organ.free, mass, mass[organ.free].mean())
+    self.constants = rod.constants(organ.rest, organ.radius, organ.config, mass, organ.clamped)
+    self.own = layout.carve(RodState, self.state, sizes)
+    values = self.constants | dict(
+      flex=organ.flex,
+      newton=organ.config.iterations,
+      most_rows=_MOST_ROWS * n,
+      mass=mass,
+      held=held.ravel(),
+      rest=organ.rest,
+      dofadr=organ.dofadr,
+      qposadr=organ.qposadr,
+      bodyid=organ.body,
+      massadr=np.where(organ.free[:, None], coupling.mass_addresses(m, dofs), -1),
+      own_dof=own_dof,
+      frame=organ.frame,
+      **{name: np.zeros((n, 3)) for name in ("start", "vel", "external", "aim", "place")},
+      **{name: np.zeros(4 * n) for name in ("force", "move", "trial", "gradient")},
+      matrix=np.zeros((4 * n, 11)),
+      inverse=np.zeros((4 * n, 11)),
+      turn=np.zeros(n),
+      status=np.zeros(1),
+      count=np.zeros(1),
+      row_kind=np.zeros(_MOST_ROWS * n),
+      row_node=np.zeros(_MOST_ROWS * n),
+      row_value=np.zeros((_MOST_ROWS * n, 9)),
+      own=self.own,
+      mj=coupling.mujoco_arrays(model, self.data),
+      nv=m.nv,
+      memory=coupling.wrap(self.data, mjstruct.size(mjstruct.Data) // 8, wp.uint64),
+      **{name: getattr(found, name) for name in _MUJOCOS},
+    )
+    with graphs.lock:
+      cpu = wp.get_device("cpu")
+      self.fields = fill(Rod, cpu, values)
+      for each in (begin, end):
+        each.load(cpu)
+      self._begin, self._end = begin.command(self.fields), end.command(self.fields)
+    self._status = self.fields.status.numpy().data
+    self.seen.identity = mjstruct.Identity(model)
+    self.seen.warning = mjstruct.warnings(self.data)
+
+  @property
+  def plugin_state(self) -> np.ndarray:
+    """The thread's own numbers."""
+    return self.state.numpy()
+
+  def run(self):
+    """Takes the thread's step and adds it to qfrc_passive."""
+    state = self.plugin_state
+    if state[-1] != self.organ.signature:
+      if state[-1] or not (np.abs(state) < _HUGE).all():
+        raise ValueError(
+          "plugin_state is not one of this thread, but saved from another model or damaged; reset "
+          "the data, or set a state that was saved from it"
+        )
+    self._begin.launch()
+    self.report.computed = True
+    if self._status[0] < 0:
+      self.note("the step has no finite solution: the motion diverged")
+
+  def step(self):
+    """Ends the step after MuJoCo has moved."""
+    if self.report.computed:
+      self._end.launch()
+      self.plugin_state[-1] = self.organ.signature
+    self.report.computed = False
+
+  def note(self, text: str):
+    """Keeps the first error and says it."""
+    if self.report.error is None:
+      self.report.error = f"thread {self.organ.name!r}: {text}"
+      mjstruct.warn(self.report.error)
+
+  def forget(self):
+    """Forgets what went wrong."""
+    self.report.error = None
+
+
+def make(model: int, data: int, instance: int) -> Workspace:
+  """Returns a thread in a fresh mjData; makes the model fit it."""
+  with graphs.lock:
+    organ = read(model, instance)
+    prepare.fit_thread(mjstruct.Model.from_address(model), organ.flex, organ.body[organ.free])
+    return Workspace(organ, model, data, instance)

@@ -1,0 +1,212 @@
+// An implicit Euler step of a rod: the least of
+//
+//   sum m / (2 h^2) |x - x0 - h v - h^2 f / m|^2 + E(x) + h^2 sum s(J a - aref),  a = (x - x0 - h v) / h^2
+//
+// by Newton's method with a line search. The last sum is MuJoCo's cost of the constraints that the rod
+// takes part in (Todorov 2014, doi:10.1109/ICRA.2014.6907751), with the rod's own stiffness in place of
+// MuJoCo's inertia. A row's dofs are those of two neighbouring nodes, so the matrix stays banded.
+#pragma once
+#include "tissue/rod.h"
+
+AS_WRITTEN
+
+namespace palpate {
+
+constexpr int DOFS = 6;  // of the two nodes that a row reaches
+// Newton's method ends when no node moves by more than this share of the shortest edge.
+constexpr double CLOSE = 1e-7;
+constexpr double SLOPE = 1e-4;  // of a step's decrease, the least (Armijo)
+constexpr int HALVINGS = 30;
+
+// What MuJoCo's rows are to their cost: both signs, one, or a cone, whose further rows follow.
+enum RowKind { BOTH, ONE, CONE, FRICTION };
+
+// A row of constraints, in the solver's memory.
+template <class Fields>
+struct RodRow {
+  const Fields& f;
+  int r;
+  PALPATE int kind() const { return f.row_kind.data[r]; }
+  PALPATE int node() const { return f.row_node.data[r]; }
+  PALPATE const double* J() const { return f.row_value.data + (DOFS + 3) * r; }
+  PALPATE double rest() const { return J()[DOFS]; }      // what other bodies add, less aref
+  PALPATE double D() const { return J()[DOFS + 1]; }
+  PALPATE double friction() const { return J()[DOFS + 2]; }  // of a cone's first row, its mu
+
+  // J a - aref where the rod's nodes accelerate by (x - x_free) / h^2.
+  PALPATE double residual(const double* x, double h) const {
+    double sum = rest();
+    for (int k = 0; k < DOFS; ++k) {
+      if (J()[k] == 0.0) continue;
+      const int at = 3 * node() + k;
+      sum += J()[k] * (x[at] - f.start.data[at] - h * f.vel.data[at]) / (h * h);
+    }
+    return sum;
+  }
+};
+
+// Adds force J to a gradient by place, and stiffness J J^T to the matrix.
+template <class Fields>
+PALPATE void add_row(const Fields&, int node, const double* J, double force, double stiffness, double* g, double* H) {
+  const double v[7] = {J[0], J[1], J[2], 0.0, J[3], J[4], J[5]};
+  const int n = J[3] == 0.0 && J[4] == 0.0 && J[5] == 0.0 ? 3 : 7;
+  add_term(g, H, 4 * node, v, n, force, stiffness);
+}
+
+// The cost of a cone (MuJoCo, Computation, elliptic cones) whose first row is r; adds its gradient and
+// second derivative where there are a gradient and a matrix.
+template <class Fields>
+PALPATE double cone(const Fields& f, int r, int dim, const double* x, double h, double* g, double* H) {
+  const RodRow<Fields> first{f, r};
+  const double mu = first.friction(), per = 1.0 / (h * h);
+  double u[6], slope[6], T2 = 0.0, cost = 0.0;
+  for (int k = 0; k < dim; ++k) {
+    const RodRow<Fields> row{f, r + k};
+    slope[k] = row.friction();
+    u[k] = row.residual(x, h) * slope[k];
+    if (k) T2 += u[k] * u[k];
+  }
+  const double N = u[0], T = sqrt(T2);
+  if (N >= mu * T || (T < 1e-300 && N >= 0.0)) return 0.0;
+  if (mu * N + T <= 0.0 || T < 1e-300) {
+    for (int k = 0; k < dim; ++k) {
+      const RodRow<Fields> row{f, r + k};
+      const double residual = u[k] / slope[k];
+      cost += 0.5 * row.D() * residual * residual;
+      if (g) add_row(f, row.node(), row.J(), row.D() * residual, row.D() * per, g, H);
+    }
+    return cost;
+  }
+  const double Dm = first.D() / (mu * mu * (1.0 + mu * mu)), off = N - mu * T;
+  cost = 0.5 * Dm * off * off;
+  if (!g) return cost;
+  double v[DOFS] = {}, tangent[DOFS] = {};
+  for (int k = 0; k < dim; ++k) {
+    const RodRow<Fields> row{f, r + k};
+    for (int c = 0; c < DOFS; ++c) {
+      v[c] += slope[k] * row.J()[c] * (k ? -mu * u[k] / T : 1.0);
+      if (k) tangent[c] += slope[k] * row.J()[c] * u[k] / T;
+    }
+  }
+  const double bends = -Dm * off * mu / T;  // of the length of the tangential part
+  add_row(f, first.node(), v, Dm * off, Dm * per, g, H);
+  for (int k = 1; k < dim; ++k) {
+    const RodRow<Fields> row{f, r + k};
+    double w[DOFS];
+    for (int c = 0; c < DOFS; ++c) w[c] = slope[k] * row.J()[c] - u[k] / T * tangent[c];
+    add_row(f, row.node(), w, 0.0, bends * per, g, H);
+  }
+  return cost;
+}
+
+// The cost of all rows; adds its gradient and second derivative where there are a gradient and a matrix.
+template <class Fields>
+PALPATE double rows_cost(const Fields& f, const double* x, double h, double* g, double* H) {
+  double cost = 0.0;
+  const int n = f.count.data[0];
+  for (int r = 0; r < n;) {
+    const RodRow<Fields> row{f, r};
+    if (row.kind() == CONE) {
+      int dim = 1;
+      while (r + dim < n && f.row_kind.data[r + dim] == FRICTION) ++dim;
+      cost += cone(f, r, dim, x, h, g, H);
+      r += dim;
+      continue;
+    }
+    const double residual = row.residual(x, h);
+    ++r;
+    if (row.kind() == ONE && residual >= 0.0) continue;
+    cost += 0.5 * row.D() * residual * residual;
+    if (g) add_row(f, row.node(), row.J(), row.D() * residual, row.D() / (h * h), g, H);
+  }
+  return cost;
+}
+
+template <class Fields>
+PALPATE double step_cost(const Fields& f, const double* x, const double* turn, double h) {
+  double sum = 0.0;
+  for (int i = 0; i < f.nnode; ++i) {
+    const D3 off = load(x + 3 * i) - load(f.aim.data + 3 * i);
+    sum += 0.5 * f.mass.data[i] / (h * h) * dot(off, off) + 0.5 * f.spin.data[i] / (h * h) * turn[i] * turn[i];
+  }
+  return sum + rod_energy(f, x, turn) + h * h * rows_cost(f, x, h, (double*)nullptr, (double*)nullptr);
+}
+
+// The gradient and the matrix at a trial state, without the constraints' part.
+template <class Fields>
+PALPATE void assemble(const Fields& f, const double* x, const double* turn, double h, double* g, double* H) {
+  const int n = 4 * f.nnode;
+  for (int a = 0; a < n; ++a) g[a] = 0.0;
+  for (int a = 0; a < WIDTH * n; ++a) H[a] = 0.0;
+  for (int i = 0; i < f.nnode; ++i) {
+    for (int c = 0; c < 3; ++c) {
+      const double m = f.mass.data[i] / (h * h);
+      g[4 * i + c] = m * (x[3 * i + c] - f.aim.data[3 * i + c]);
+      entry(H, 4 * i + c, 4 * i + c) = m;
+    }
+    g[4 * i + 3] = f.spin.data[i] / (h * h) * turn[i];
+    entry(H, 4 * i + 3, 4 * i + 3) = f.spin.data[i] / (h * h);
+  }
+  add_rod(f, x, turn, g, H);
+}
+
+// Takes unknowns out that do not change.
+template <class Fields>
+PALPATE void hold(const Fields& f, double* g, double* H) {
+  const int n = 4 * f.nnode;
+  for (int a = 0; a < n; ++a) {
+    if (!f.held.data[a]) continue;
+    g[a] = 0.0;
+    for (int b = first_in_band(a); b < a; ++b) entry(H, a, b) = 0.0;
+    for (int b = a + 1; b < n && b <= a + BAND; ++b) entry(H, b, a) = 0.0;
+    entry(H, a, a) = 1.0;
+  }
+}
+
+// Takes the step from f.start and f.vel: f.place and f.turn are where it ends, f.predicted the force of
+// the constraints there. Returns how many iterations it took, or -1 where nothing finite was found.
+template <class Fields>
+PALPATE int step_rod(const Fields& f, double h) {
+  const int n = 4 * f.nnode;
+  double* x = f.place.data;
+  double* turn = f.turn.data;
+  double* g = f.gradient.data;
+  double* H = f.matrix.data;
+  double* trial = f.trial.data;
+  double* trial_turn = f.trial.data + 3 * f.nnode;
+  double cost = step_cost(f, x, turn, h);
+  int iteration = 0;
+  for (; iteration < f.newton; ++iteration) {
+    assemble(f, x, turn, h, g, H);
+    rows_cost(f, x, h, g, H);
+    hold(f, g, H);
+    for (int a = 0; a < n; ++a) f.move.data[a] = -g[a];
+    factorize(H, n);
+    solve_factorized(H, f.move.data, n);
+    double falls = 0.0, most = 0.0;
+    for (int a = 0; a < n; ++a) falls += g[a] * f.move.data[a];
+    for (int i = 0; i < f.nnode; ++i) {
+      const double far = norm(load(f.move.data + 4 * i));
+      most = far > most ? far : most;
+    }
+    if (!(falls == falls) || !(most < 1e6)) return -1;
+    double part = 1.0;
+    for (int k = 0; k < HALVINGS; ++k, part *= 0.5) {
+      for (int i = 0; i < f.nnode; ++i) {
+        store(trial + 3 * i, load(x + 3 * i) + part * load(f.move.data + 4 * i));
+        trial_turn[i] = turn[i] + part * f.move.data[4 * i + 3];
+      }
+      const double next = step_cost(f, trial, trial_turn, h);
+      if (next <= cost + SLOPE * part * falls || -part * falls < 1e-13 * cost) {
+        cost = next;
+        break;
+      }
+    }
+    for (int a = 0; a < 3 * f.nnode; ++a) x[a] = trial[a];
+    for (int i = 0; i < f.nnode; ++i) turn[i] = trial_turn[i];
+    if (part * most < CLOSE * f.shortest) return iteration + 1;
+  }
+  return iteration;
+}
+
+}  // namespace palpate

@@ -1,0 +1,164 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""Surgical threads: `add_thread` adds one to an `mujoco.MjSpec`, `Thread` is the handle on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+
+from . import authoring, windows
+from .attributes import CONTACT, text
+from .engine import plugin as engine
+from .organ import instances
+from .tissue import config as configuration
+from .tissue import rod
+from .tissue.sutures import DIAMETER, SUTURES
+
+_RGBA = (0.35, 0.2, 0.5, 1.0)  # violet, as absorbable threads are dyed
+
+
+def add_thread(
+  spec: mujoco.MjSpec,
+  points,
+  name: str = "thread",
+  *,
+  material: str = "silk",
+  size: str = "3-0",
+  parent: mujoco.MjsBody | str | None = None,
+  pos: Sequence[float] = (0.0, 0.0, 0.0),
+  quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
+  pin: Sequence[int] = (),
+  rgba: Sequence[float] = _RGBA,
+  contact: Mapping[str, object] | None = None,
+  **config,
+) -> mujoco.MjsFlex:
+  """Adds a surgical thread to a spec, in a body of its name, as a <flexcomp> of dim 1 in MJCF.
+
+  It is straight where nothing acts, whatever line it starts on. An end is fixed to an instrument or
+  a needle by a <connect> of its node's body, `<name>_<k>`.
+
+  Args:
+    spec: changed in place, unless an error is raised
+    points: its nodes, two or more, no closer than its radius [m]  (n, 3)
+    name: of flex, body and plugin instance; the nodes' bodies are `<name>_<k>`
+    material: `vicryl`, `silk` or `polypropylene`
+    size: `3-0`, `4-0` or `5-0`
+    parent: what the body is in, which must not move; None for the world
+    pos: of the body in its parent [m]
+    quat: orientation of the body in its parent
+    pin: nodes that do not move; two next to each other hold the direction and turn of their edge
+    rgba: colour
+    contact: attributes of <contact> that are not as usual
+    **config: keys of a rod that are not the material's: young, poisson, bend, twist
+
+  Returns:
+    The flex, for instance to give it a material.
+
+  Raises:
+    ValueError: a key, value, name or point is not allowed; the message says what is.
+  """
+  for what, value, known in (("material", material, SUTURES), ("size", size, DIAMETER)):
+    if value not in known:
+      raise ValueError(f"thread {name!r}: {what} is {value!r}, expected one of {', '.join(known)}")
+  suture, radius = SUTURES[material], 0.5 * DIAMETER[size]
+  nodes = np.asarray(points, dtype=float)
+  if nodes.ndim != 2 or nodes.shape[1] != 3 or len(nodes) < 2 or not np.isfinite(nodes).all():
+    raise ValueError(f"thread {name!r}: points is {nodes.shape}, expected (n, 3), n of 2 or more")
+  length = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
+  rod.check_edges(name, length, radius)
+  own = {"young": suture.young, "bend": suture.bend, "twist": suture.twist} | config
+  texts = {key: text(value, 17) for key, value in own.items()} | {"elements": "rod"}
+  given = {**CONTACT, "friction": suture.friction, **(contact or {})}
+  try:
+    pins = authoring.pinned(name, pin, len(nodes))
+    configuration.parse(name, texts, len(length), closed=False)
+    look = authoring.look_of(name, radius, rgba) | authoring.contact_of(name, given)
+    where = authoring.parent_of(spec, name, parent)
+    authoring.check_names(spec, name, len(nodes))
+  except ValueError as error:
+    raise ValueError(str(error).replace("organ ", "thread ", 1)) from None
+  body = where.add_body(name=name, pos=pos, quat=quat)
+  mass = suture.density * np.pi * radius**2 * length.sum() / len(nodes)
+  placed = authoring.add_nodes(spec, body, nodes, pins, mass, texts)
+  elem = np.arange(len(length))[:, None] + (0, 1)
+  return windows.make_flex(spec, name, *placed, elem, **look)
+
+
+class Thread:
+  """Places, tension and twist of a thread, in world coordinates and SI units.
+
+  Args:
+    model: the compiled model
+    data: its data
+    name: name of the flexcomp
+
+  Raises:
+    ValueError: the model has no thread of that name; the message lists those it has.
+  """
+
+  def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, name: str):
+    threads = instances(model, dim=1)
+    if name not in threads:
+      have = ", ".join(repr(key) for key in threads) or "none"
+      raise ValueError(f"no thread {name!r} in the model, it has {have}")
+    self.model, self.data, self.name = model, data, name
+    self._space = engine.find_thread(data._address, threads[name])
+
+  @property
+  def positions(self) -> np.ndarray:
+    """Places of the nodes [m], (nnode, 3)."""
+    organ = self._space.organ
+    return organ.origin + self._local() @ organ.frame.T
+
+  def _local(self) -> np.ndarray:
+    """Returns places in the slides' axes [m], (nnode, 3)."""
+    organ = self._space.organ
+    out, at = organ.rest.copy(), organ.qposs.reshape(-1, 3)
+    out[organ.free] += self.data.qpos[at] - self.model.qpos0[at]
+    return out
+
+  @property
+  def length(self) -> float:
+    """Length now [m]."""
+    return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+  @property
+  def tension(self) -> np.ndarray:
+    """Tension of each edge [N], (nnode - 1,); negative where it is compressed."""
+    return rod.tension(self._space.constants, self._local())
+
+  @property
+  def twist(self) -> np.ndarray:
+    """Twist at each node between two edges, 0 at the ends [rad], (nnode,)."""
+    return self._space.own.twist.numpy().copy()
+
+  @property
+  def energy(self) -> float:
+    """Elastic energy [J]."""
+    return rod.energy(self._space.constants, self._local(), self.twist)
+
+  def turn(self, edge: int, angle: float):
+    """Turns a clamped edge about itself, from the first to the second of its nodes.
+
+    Args:
+      edge: number of an edge between two pinned nodes
+      angle: by how much [rad]
+
+    Raises:
+      ValueError: the edge is not clamped.
+    """
+    clamped = np.flatnonzero(self._space.organ.clamped)
+    if edge not in clamped:
+      have = ", ".join(map(str, clamped)) or "none"
+      raise ValueError(f"thread {self.name!r}: edge {edge} is not clamped, expected one of {have}")
+    twist = self._space.own.twist.numpy()
+    twist[edge] += angle * (edge > 0)
+    twist[edge + 1] -= angle * (edge + 2 < len(twist))
+
+  @property
+  def error(self) -> str | None:
+    """What went wrong since the last reset, or None."""
+    return self._space.report.error

@@ -1,0 +1,77 @@
+"""What a thread's configuration and shape make of its stiffness; see `native/tissue/rod.h`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .config import Config
+
+
+def check_edges(name: str, length: np.ndarray, radius: float):
+  """Raises ValueError where an edge is shorter than the radius."""
+  if length.min() < radius:
+    k = int(length.argmin())
+    raise ValueError(
+      f"thread {name!r}: edge {k} is {1e3 * length[k]:.3g} mm long and radius is "
+      f"{1e3 * radius:.3g} mm, expected edges no shorter than the radius"
+    )
+
+
+def tension(constants: dict, x: np.ndarray) -> np.ndarray:
+  """Returns the tension of the edges [N], (nnode - 1,), at places x [m], (nnode, 3)."""
+  length = np.linalg.norm(np.diff(x, axis=0), axis=1)
+  return (constants["stretch"][:-1] * (length - constants["length"][:-1])).astype(float)
+
+
+def energy(constants: dict, x: np.ndarray, twist: np.ndarray) -> float:
+  """Returns the elastic energy [J] at places x [m], (nnode, 3), and twists [rad], (nnode,)."""
+  edge = np.diff(x, axis=0)
+  length = np.linalg.norm(edge, axis=1)
+  stretched = 0.5 * constants["stretch"][:-1] * (length - constants["length"][:-1]) ** 2
+  e, f = edge[:-1], edge[1:]
+  chi = length[:-1] * length[1:] + (e * f).sum(axis=1)
+  curvature2 = 4 * (np.cross(e, f) ** 2).sum(axis=1) / chi**2
+  bent = 0.5 * constants["bend"][1:-1] * curvature2
+  return float(stretched.sum() + bent.sum() + 0.5 * (constants["torsion"] * twist**2).sum())
+
+
+def constants(
+  rest: np.ndarray, radius: float, config: Config, mass: np.ndarray, clamped: np.ndarray
+) -> dict:
+  """Returns the constants of a rod of round section.
+
+  A = pi r^2, I = pi r^4 / 4, J = 2 I, G = E / (2 (1 + poisson)); bending and twisting have factors
+  of their own, since the fibres of a braid slide on each other.
+
+  Args:
+    rest: nodes, straight or not: only the lengths of edges count [m]  (nnode, 3)
+    radius: of the section [m]
+    config: its configuration
+    mass: of each node [kg]                                            (nnode,)
+    clamped: whether an edge is rigid                                  (nnode - 1,) bool
+
+  Returns:
+    fields of the native struct by name
+  """
+  n = len(rest)
+  length = np.linalg.norm(np.diff(rest, axis=0), axis=1)
+  young = np.broadcast_to(np.asarray(config.young, float), (n - 1,))
+  area, second = np.pi * radius**2, np.pi * radius**4 / 4
+  half = np.where(clamped, 0.0, 0.5 * length)
+  at = half[1:] + half[:-1]  # what belongs to a node inside
+  at[at == 0.0] = np.inf  # between rigid edges
+  node_young = 0.5 * (young[1:] + young[:-1])
+  shear = node_young / (2 * (1 + config.poisson))
+  bend, torsion = np.zeros(n), np.zeros(n)
+  bend[1:-1] = config.bend * node_young * second / at
+  torsion[1:-1] = config.twist * shear * 2 * second / at
+  return {
+    "nnode": n,
+    "twists": int(config.twist > 0),
+    "shortest": float(length.min()),
+    "length": np.append(length, 0.0),
+    "stretch": np.append(young * area / length, 0.0),
+    "bend": bend,
+    "torsion": torsion,
+    "spin": np.append(0.25 * (mass[1:] + mass[:-1]), 1.0) * radius**2,
+  }

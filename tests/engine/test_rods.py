@@ -1,0 +1,301 @@
+"""Threads: closed forms of rods, contacts by MuJoCo, states, bad input."""
+
+import mujoco
+import numpy as np
+import palpate
+import pytest
+from scipy.optimize import brentq
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+RADIUS, YOUNG, POISSON, MASS = 1e-4, 5e9, 0.3, 8e-6
+STRETCH = YOUNG * np.pi * RADIUS**2  # E A [N]
+BENDING = YOUNG * np.pi * RADIUS**4 / 4  # E I [N m^2]
+
+
+def line(n, length, start=0.0):
+  points = np.zeros((n, 3))
+  points[:, 0] = start + np.linspace(0, length, n)
+  return points
+
+
+def document(points, *, pin=(), h=1e-3, world="", after="", option="", contact="", flex="", **keys):
+  """Returns MJCF with a thread `t`."""
+  config = {"elements": "rod", "young": YOUNG, "poisson": POISSON} | keys
+  config = "".join(f'<config key="{key}" value="{value}"/>' for key, value in config.items())
+  pins = f'<pin id="{" ".join(map(str, pin))}"/>' if len(pin) else ""
+  elem = " ".join(f"{i} {i + 1}" for i in range(len(points) - 1))
+  return f"""<mujoco><option timestep="{h}" {option}/>
+    <extension><plugin plugin="palpate.organ"/></extension><worldbody>{world}
+    <flexcomp name="t" type="direct" dim="1" radius="{RADIUS}" mass="{MASS}" {flex}
+      point="{" ".join(map(repr, np.ravel(points).tolist()))}" element="{elem}">
+    <plugin plugin="palpate.organ">{config}</plugin><edge damping="1e-9"/>{pins}
+    <contact selfcollide="none" solref="0.004 1" solmix="1000" {contact}/></flexcomp>
+    </worldbody>{after}</mujoco>"""
+
+
+def load(*args, **kwargs):
+  model = mujoco.MjModel.from_xml_string(document(*args, **kwargs))
+  data = mujoco.MjData(model)
+  return model, data, palpate.Thread(model, data, "t")
+
+
+def run(model, data, steps):
+  for _ in range(steps):
+    mujoco.mj_step(model, data)
+
+
+def force(model, data, node, value):
+  adr = model.body(f"t_{node}").dofadr[0]
+  data.qfrc_applied[adr : adr + 3] = value
+
+
+FREE = 'gravity="0 0 0"'
+
+
+# Statics. Long steps lose their energy at once; a state at rest does not depend on them.
+
+
+def test_a_hanging_thread_is_a_catenary():
+  length, span, n = 0.15, 0.1, 76
+  s = np.linspace(-length / 2, length / 2, n)
+  slope = span / length
+  points = np.stack([slope * s, 0 * s, np.abs(s) * np.sqrt(1 - slope**2)], axis=1)
+  model, data, thread = load(points, pin=(0, n - 1), h=0.02, bend=1e-4)
+  run(model, data, 400)
+  a = brentq(lambda a: 2 * a * np.sinh(span / 2 / a) - length, 1e-3, 1)
+  sag = points[0, 2] - thread.positions[:, 2].min()
+  assert sag == pytest.approx(a * (np.cosh(span / 2 / a) - 1), rel=1e-2)
+  horizontal = MASS / length * 9.81 * a
+  assert thread.tension.min() == pytest.approx(horizontal, rel=1e-2)
+
+
+def test_a_pulled_thread_stretches_by_hooke():
+  model, data, thread = load(line(31, 0.06), pin=(0,), h=0.01, option=FREE)
+  force(model, data, 30, (1.0, 0, 0))
+  run(model, data, 100)
+  assert thread.length / 0.06 - 1 == pytest.approx(1.0 / STRETCH, rel=1e-6)
+  np.testing.assert_allclose(thread.tension, 1.0, rtol=1e-6)
+
+
+def test_a_cantilever_is_eulers_elastica():
+  """Of a tip load of 4 E I / L^2; from theta'' = -4 cos theta, theta(0) = theta'(1) = 0."""
+  n, length = 61, 0.06
+  edge = length / (n - 1)
+  model, data, thread = load(line(n + 1, length + edge, -edge), pin=(0, 1), h=0.02, option=FREE)
+  force(model, data, n, (0, 0, -4 * BENDING / length**2))
+  run(model, data, 400)
+  tip = thread.positions[-1] / length
+  assert -tip[2] == pytest.approx(0.66996, rel=1e-3)
+  assert 1 - tip[0] == pytest.approx(0.32894, rel=1e-3)
+
+
+@pytest.mark.parametrize(("share", "buckles"), [(0.97, False), (1.03, True)])
+def test_a_column_buckles_at_eulers_load(share, buckles):
+  n, length = 41, 0.06
+  edge = length / (n - 1)
+  model, data, thread = load(line(n + 1, length + edge, -edge), pin=(0, 1), h=0.1, option=FREE)
+  data.qpos[2::3] += 1e-5 * np.linspace(0, 1, n - 1) ** 2
+  force(model, data, n, (-share * np.pi**2 * BENDING / 4 / length**2, 0, 0))
+  run(model, data, 1200)
+  assert (abs(thread.positions[-1, 2]) > 0.1 * length) == buckles
+
+
+@pytest.mark.parametrize(("share", "buckles"), [(0.95, False), (1.05, True)])
+def test_a_twisted_rod_buckles_at_greenhills_twist(share, buckles):
+  """Clamped ends, no tension: G J theta / (2 E I) = 4.4934, the first root of tan x = x."""
+  n, length = 41, 0.04
+  edge = length / (n - 1)
+  pins = (0, 1, n, n + 1)
+  model, data, thread = load(
+    line(n + 2, length + 2 * edge, -edge), pin=pins, h=0.05, option=FREE
+  )
+  critical = 2 * 4.4934 * (1 + POISSON)
+  for _ in range(40):
+    thread.turn(n, share * critical / 40)
+    run(model, data, 1)
+  assert thread.twist.sum() == pytest.approx(share * critical, rel=1e-9)
+  data.qpos[1::3] += 1e-6 * np.sin(np.pi * np.linspace(0, 1, n - 2))
+  run(model, data, 150)
+  # The ends stay where they are: it buckles as far as it stretches.
+  assert (np.abs(thread.positions[:, 1:]).max() > 5e-6) == buckles
+  assert thread.twist.sum() == pytest.approx(share * critical, rel=1e-3)
+
+
+# Motion.
+
+
+def test_free_flight_keeps_momentum():
+  model, data, _ = load(line(31, 0.06), option=FREE)
+  rng = np.random.RandomState(0)
+  data.qvel[:] = np.repeat(rng.normal(0, 0.1, (7, 3)), 5, axis=0)[:31].ravel()
+  before = data.qvel.reshape(-1, 3).sum(axis=0)
+  run(model, data, 300)
+  np.testing.assert_allclose(data.qvel.reshape(-1, 3).sum(axis=0), before, rtol=1e-9)
+
+
+def test_energy_only_falls():
+  model, data, thread = load(line(41, 0.08), pin=(0,), option=FREE)
+  rng = np.random.RandomState(1)
+  data.qvel[:] = np.repeat(rng.normal(0, 1.0, (8, 3)), 5, axis=0).ravel()
+  energies = []
+  for _ in range(300):
+    run(model, data, 1)
+    energies.append(0.5 * MASS / 41 * (data.qvel**2).sum() + thread.energy)
+  assert (np.diff(energies) <= 1e-9 * energies[0]).all()
+  assert thread.error is None
+
+
+@pytest.mark.parametrize("h", [1e-3, 2e-3])
+def test_a_sudden_pull_of_a_newton_is_borne(h):
+  model, data, thread = load(line(61, 0.12), pin=(0,), h=h)
+  run(model, data, 200)
+  force(model, data, 60, (0.6, 0.8, 0))
+  run(model, data, 300)
+  assert thread.error is None
+  np.testing.assert_allclose(thread.tension, 1.0, rtol=0.02)
+  assert np.abs(data.qvel).max() < 0.1
+
+
+# Contacts are MuJoCo's.
+
+
+def capstan(friction, cone, kind="cylinder", h=1e-3):
+  """Returns a thread half around a drum, its left end loaded, its right end on a slide."""
+  drum, tail, n = 0.01, 0.03, 81
+  r = drum + RADIUS
+  s = np.linspace(0, np.pi * r + 2 * tail, n)
+  angle = np.clip(np.pi - (s - tail) / r, 0, np.pi)
+  below = np.maximum(tail - s, 0) + np.maximum(s - tail - np.pi * r, 0)
+  points = np.stack([r * np.cos(angle), 0 * s, r * np.sin(angle) - below], axis=1)
+  x, _, z = points[-1]
+  world = f"""<geom type="{kind}" size="{drum} .02" euler="90 0 0" friction="{friction} 0 0"/>
+    <body name="puller" pos="{x} 0 {z}"><joint name="pull" type="slide" axis="0 0 -1"/>
+    <geom size=".002" mass=".1" contype="0" conaffinity="0"/></body>"""
+  after = f"""<equality><connect body1="puller" body2="t_{n - 1}" anchor="0 0 0" solref=".002 1"/>
+    </equality><actuator><velocity joint="pull" kv="100"/></actuator>"""
+  contact = f'friction="{friction} 0 0" condim="3"'
+  option = f'cone="{cone}" {FREE}'
+  return load(points, world=world, after=after, contact=contact, option=option, bend=0.01, h=h)
+
+
+@pytest.mark.parametrize(
+  ("friction", "cone", "kind"), [(0.3, "pyramidal", "cylinder"), (0.3, "elliptic", "capsule")]
+)
+def test_a_thread_around_a_drum_obeys_the_capstan_law(friction, cone, kind):
+  model, data, thread = capstan(friction, cone, kind)
+  force(model, data, 0, (0, 0, -0.1))
+  pulls = []
+  for k in range(600):
+    data.ctrl[0] = 0.01 * min(1.0, k / 50)
+    run(model, data, 1)
+    pulls.append(data.actuator_force[0])
+  ratio = np.array(pulls[300:]) / 0.1
+  np.testing.assert_allclose(ratio, np.exp(friction * np.pi), rtol=0.03)
+  tension = thread.tension
+  assert tension[-1] / tension[0] == pytest.approx(np.exp(friction * np.pi), rel=0.03)
+
+
+def test_a_thread_comes_to_rest_on_a_floor():
+  world = '<geom type="plane" size="1 1 .1" pos="0 0 -.002"/>'
+  model, data, thread = load(line(41, 0.08), world=world)
+  run(model, data, 600)
+  low = thread.positions[:, 2] + 0.002 - RADIUS
+  assert np.abs(low).max() < 0.1 * RADIUS
+  assert np.abs(data.qvel).max() < 1e-4
+  weight = data.efc_force.sum() if data.nefc else 0.0
+  assert weight == pytest.approx(MASS * 9.81, rel=0.02)  # pyramids share their normal force
+
+
+# States.
+
+
+def test_a_state_has_all_there_is_to_the_bit():
+  points = line(21, 0.04)
+  args = dict(pin=(0, 1, 19, 20), world='<geom type="capsule" size=".004 .02" pos=".02 0 -.006"/>')
+  model, data, thread = load(points, **args)
+  data.qvel[1::3] = 0.05
+  data.qvel[2::3] = -0.2
+  thread.turn(0, 0.3)
+  run(model, data, 80)
+  other = mujoco.MjData(model)
+  run(model, other, 7)
+  state = np.zeros(mujoco.mj_stateSize(model, STATE))
+  mujoco.mj_getState(model, data, state, STATE)
+  mujoco.mj_setState(model, other, state, STATE)
+  copied = mujoco.MjData(model)
+  mujoco.mj_copyData(copied, model, data)
+  for each in (data, other, copied):
+    run(model, each, 60)
+    np.testing.assert_array_equal(each.qpos, data.qpos)
+    np.testing.assert_array_equal(each.plugin_state, data.plugin_state)
+  assert np.abs(thread.twist).max() > 1e-3
+
+
+def test_reset_forgets_twist_and_errors():
+  model, data, thread = load(line(11, 0.02), pin=(0, 1))
+  thread.turn(0, 0.3)
+  data.qpos[0] = np.nan
+  run(model, data, 2)
+  assert "position (qpos 0) is not finite" in thread.error
+  mujoco.mj_resetData(model, data)
+  run(model, data, 1)
+  assert thread.error is None
+  assert np.abs(thread.twist).max() < 1e-6
+
+
+def test_a_foreign_state_is_refused():
+  model, data, thread = load(line(11, 0.02))
+  data.plugin_state[:] = 3.0
+  run(model, data, 1)
+  assert "not one of this thread" in thread.error
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+  ("kwargs", "message"),
+  [
+    (dict(points=line(5, 3e-4)), r"edge \d is 0.075 mm long and radius is 0.1 mm"),
+    (dict(points=line(5, 0.01), thickness=0.001), "thickness is set and elements is 'rod'"),
+    (dict(points=line(5, 0.01), twist=-1), "thread 't': twist is '-1', expected a number >= 0"),
+    (dict(points=line(5, 0.01), option='integrator="RK4"'), "RK4"),
+    (dict(points=line(5, 0.01), elements="solid"), "flexcomp dim is 1, expected dim='2'"),
+    (dict(points=line(5, 0.01), contact='selfcollide="auto"'), "selfcollide"),
+  ],
+)  # fmt: skip
+def test_bad_threads_are_named(kwargs, message):
+  text = document(kwargs.pop("points"), **kwargs)
+  if "selfcollide" in message:
+    text = text.replace('selfcollide="none" ', "")
+  with pytest.raises(ValueError, match=message):
+    mujoco.MjModel.from_xml_string(text)
+
+
+def test_add_thread_writes_what_mjcf_says():
+  spec = mujoco.MjSpec()
+  spec.option.gravity = 0, 0, 0
+  palpate.add_thread(spec, line(21, 0.04), "silk", material="silk", size="4-0", pin=(0,))
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  thread = palpate.Thread(model, data, "silk")
+  adr = model.body("silk_20").dofadr[0]
+  data.qfrc_applied[adr] = 0.5
+  run(model, data, 300)
+  stretch = 8.7e9 * np.pi * (0.0875e-3) ** 2
+  assert thread.length / 0.04 - 1 == pytest.approx(0.5 / stretch, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+  ("kwargs", "message"),
+  [
+    (dict(points=[[0, 0, 0]]), r"points is \(1, 3\), expected \(n, 3\), n of 2 or more"),
+    (dict(material="nylon"), "material is 'nylon', expected one of vicryl, silk, polypropylene"),
+    (dict(size="9-0"), "size is '9-0', expected one of 3-0, 4-0, 5-0"),
+    (dict(pin=(30,)), "thread 'thread': pin has 30"),
+    (dict(foundation=3), "foundation is set and elements is 'rod'"),
+  ],
+)
+def test_add_thread_names_bad_input(kwargs, message):
+  with pytest.raises(ValueError, match=message):
+    palpate.add_thread(mujoco.MjSpec(), kwargs.pop("points", line(11, 0.02)), **kwargs)
