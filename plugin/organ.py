@@ -432,7 +432,8 @@ class Attachment:
 
 def instances(model: mujoco.MjModel, dim: int = 2) -> dict[str, int]:
   """Returns the plugin instance of each organ of a model, or with `dim` 1 thread, by its name."""
-  found = {flex: _instance(model, flex) for flex in range(model.nflex) if model.flex_dim[flex] == dim}
+  flexes = np.flatnonzero(model.flex_dim == dim).tolist()
+  found = {flex: _instance(model, flex) for flex in flexes}
   return {
     mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, flex) or "": instance
     for flex, instance in found.items()

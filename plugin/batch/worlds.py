@@ -59,6 +59,8 @@ class Worlds(Batch):
   ):
     target = _resolve(device)
     model = spec.compile()
+    if threads := list(instances(model, dim=1)):
+      raise ValueError(f"the scene has thread {threads[0]!r}, expected none in a batch on a GPU")
     super().__init__(model, nworld, target)
     self.scratch = mujoco.MjData(model)  # its plugin knows what the organs are
     spaces = {

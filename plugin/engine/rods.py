@@ -259,6 +259,7 @@ class Workspace:
         each.load(cpu)
       self._begin, self._end = begin.command(self.fields), end.command(self.fields)
     self._status = self.fields.status.numpy().data
+    self.seen.signature = self.own.signature.numpy().data
     self.seen.identity = mjstruct.Identity(model)
     self.seen.warning = mjstruct.warnings(self.data)
 
@@ -269,9 +270,8 @@ class Workspace:
 
   def run(self):
     """Takes the thread's step and adds it to qfrc_passive."""
-    state = self.plugin_state
-    if state[-1] != self.organ.signature:
-      if state[-1] or not (np.abs(state) < _HUGE).all():
+    if self.seen.signature[0] != self.organ.signature:
+      if self.seen.signature[0] or not (np.abs(self.plugin_state) < _HUGE).all():
         raise ValueError(
           "plugin_state is not one of this thread, but saved from another model or damaged; reset "
           "the data, or set a state that was saved from it"
@@ -285,7 +285,7 @@ class Workspace:
     """Ends the step after MuJoCo has moved."""
     if self.report.computed:
       self._end.launch()
-      self.plugin_state[-1] = self.organ.signature
+      self.seen.signature[0] = self.organ.signature
     self.report.computed = False
 
   def note(self, text: str):

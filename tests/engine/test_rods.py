@@ -4,6 +4,8 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
+import trimesh
+from palpate import batch
 from scipy.optimize import brentq
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -206,6 +208,30 @@ def test_a_thread_comes_to_rest_on_a_floor():
   assert weight == pytest.approx(MASS * 9.81, rel=0.02)  # pyramids share their normal force
 
 
+def test_a_thread_over_an_organ_is_borne_by_it():
+  """Its weight and two loads are the organ's contact force."""
+  spec = mujoco.MjSpec()
+  ball, r = trimesh.creation.icosphere(subdivisions=2, radius=0.03), 0.0313
+  low = np.flatnonzero(ball.vertices[:, 2] < -0.015)
+  mesh = np.array(ball.vertices), np.array(ball.faces)
+  palpate.add_organ(spec, mesh, "ball", young=1.5e4, elements="solid", pin=low)
+  s = np.linspace(-0.07, 0.07, 57)
+  angle = np.clip(s / r, -np.pi / 2, np.pi / 2)
+  below = np.abs(s - r * angle)
+  points = np.stack([r * np.sin(angle), 0 * s, r * np.cos(angle) - below], axis=1)
+  palpate.add_thread(spec, points, "t")
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  thread, organ = palpate.Thread(model, data, "t"), palpate.Organ(model, data, "ball")
+  for end in (0, 56):
+    force(model, data, end, (0, 0, -0.01))
+  run(model, data, 250)
+  weight = 9.81 * model.body("t_0").mass[0] * 57
+  assert organ.contact_force[:, 2].sum() == pytest.approx(-0.02 - weight, rel=0.01)
+  assert thread.error is organ.error is None
+  assert thread.positions[28, 2] > 0.028
+
+
 # States.
 
 
@@ -270,6 +296,20 @@ def test_bad_threads_are_named(kwargs, message):
     text = text.replace('selfcollide="none" ', "")
   with pytest.raises(ValueError, match=message):
     mujoco.MjModel.from_xml_string(text)
+
+
+def test_a_batch_on_a_gpu_refuses_threads():
+  spec = mujoco.MjSpec.from_string(document(line(5, 0.01)))
+  with pytest.raises(ValueError, match="the scene has thread 't', expected none"):
+    batch.make(spec, 2, "warp-cpu")
+
+
+def test_threads_are_stepped_in_batches_on_the_cpu():
+  model, data, _ = load(line(11, 0.02), pin=(0,))
+  worlds = batch.make(model, 3, "cpu")
+  worlds.step(30)
+  run(model, data, 30)
+  np.testing.assert_allclose(worlds.qpos.numpy()[2], data.qpos, atol=1e-8)  # single precision
 
 
 def test_add_thread_writes_what_mjcf_says():

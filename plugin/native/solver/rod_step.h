@@ -14,7 +14,7 @@ namespace palpate {
 
 constexpr int DOFS = 6;  // of the two nodes that a row reaches
 // Newton's method ends when no node moves by more than this share of the shortest edge.
-constexpr double CLOSE = 1e-7;
+constexpr double CLOSE = 1e-6;
 constexpr double SLOPE = 1e-4;  // of a step's decrease, the least (Armijo)
 constexpr int HALVINGS = 30;
 
