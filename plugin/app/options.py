@@ -23,9 +23,23 @@ def add_argument(parser: argparse.ArgumentParser):
   )
 
 
-def read(texts: list[str]) -> dict[str, Any]:
-  """Returns the options as `task_kwargs`."""
-  found = {}
+def add_observations(parser: argparse.ArgumentParser):
+  """Declares what is observed."""
+  parser.add_argument(
+    "--observations", metavar="NAME,NAME",
+    help="groups (sensors, state), pictures (pixels, ...) and single ones, by commas "
+    "(sensors,state)",
+  )  # fmt: skip
+
+
+def read(texts: list[str], observations: str | None = None) -> dict[str, Any]:
+  """Returns the options as `task_kwargs`.
+
+  Args:
+    texts: NAME=VALUE each
+    observations: names by commas, if they are given
+  """
+  found: dict[str, Any] = {"observations": observations.split(",")} if observations else {}
   for text in texts:
     name, equal, value = text.partition("=")
     if not (equal and name.isidentifier()):

@@ -24,7 +24,9 @@ from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
 from ..core.rules import (
   FAR,
+  HIDDEN,
   LATER,
+  NOW,
   RUNNING,
   SUCCESS,
   Rules,
@@ -250,9 +252,17 @@ def observe(s, o):
   return o
 
 
+def marked(o, k):
+  """Returns the number of the point where a mark is."""
+  return (2 * k * (o.count - 1) + MARKS - 1) // (2 * (MARKS - 1))
+
+
 def mark(s, o, k):
-  """Marks the curve."""
-  return place(s, o, (2 * k * (o.count - 1) + MARKS - 1) // (2 * (MARKS - 1))), LATER
+  """Marks what is left of the curve, and where to begin or to go on."""
+  at, first = marked(o, k), min(done(o), o.count - 1)
+  begins = at >= first and (k == 0 or marked(o, max(k - 1, 0)) < first)
+  look = LATER if at >= first else HIDDEN
+  return place(s, o, at), NOW if begins else look
 
 
 class Trace(Task):

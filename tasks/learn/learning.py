@@ -1,5 +1,7 @@
 # pyright: reportMissingImports=false
-"""Practice in many worlds, by proximal policy optimisation (Schulman et al. 2017), rsl_rl's.
+"""Learning in many worlds: practice is proximal policy optimisation (Schulman et al. 2017).
+
+Its steps are rsl_rl's.
 
 A checkpoint is a file of safetensors: weights and optimiser, in the header how far it has come.
 """
@@ -12,7 +14,7 @@ import json
 import math
 import pathlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -75,8 +77,8 @@ class Settings:
 TAUGHT: dict[str, Any] = {"spread": 0.25, "calm": 0.08, "entropy": 0.0, "learning_rate": 3e-4}
 
 
-class Learner:
-  """Networks that practise an exercise.
+class Student:
+  """Networks that learn an exercise in many worlds.
 
   Attributes:
     iteration: iterations done
@@ -84,48 +86,30 @@ class Learner:
     seconds: spent on it, lessons included
   """
 
+  algorithm = ""  # how it learns, for people
+  optimiser: torch.optim.Optimizer
+
   def __init__(self, env: Exercises, settings: Settings, networks: Networks, seconds: float = 0.0):
     """Begins episodes in an environment with `output="torch"`.
 
     Args:
       env: many worlds of the exercise
       settings: how to learn
-      networks: that learn; what they have not been taught they find out here
+      networks: that learn
       seconds: spent on lessons
     """
     torch.manual_seed(settings.seed)
     self.settings, self.networks = settings, networks
     self._begin(env, settings.seed)
     self.iteration, self.steps, self.seconds = 0, 0, seconds
-    self._count = max(_SHORT, math.ceil(LEAST / env.num_envs))
-    seen, count = self.env.get_observations(), self.env.num_actions
-    storage = RolloutStorage(
-      "rl", env.num_envs, self._count, seen, [count], networks.device
-    )  # fmt: skip
-    self._ppo = PPO(
-      networks.actor, networks.critic, storage, device=networks.device,
-      num_learning_epochs=settings.epochs, num_mini_batches=settings.minibatches,
-      gamma=settings.gamma, lam=settings.lam, entropy_coef=settings.entropy,
-      learning_rate=settings.learning_rate,
-    )  # fmt: skip
-    self._ppo.train_mode()
-    networks.calm(settings.spread)
-    if not networks.lessons:
-      self._look()
-    self.env.stagger(torch.Generator().manual_seed(settings.seed))
 
-  def _look(self) -> None:
-    """Learns how large observations are."""
-    seen = []
-    with torch.no_grad():
-      for _ in range(self._count):
-        seen.append(self.env.get_observations())
-        self._step(self.networks.actor(seen[-1], stochastic_output=True))
-    self.networks.actor.reset()
-    self.networks.normalise(torch.cat(seen))
+  @property
+  def groups(self) -> Mapping[str, Sequence[str]]:
+    """Names of what is observed by group."""
+    return self.networks.groups
 
   def _step(self, said: torch.Tensor):
-    """Does what the actor says."""
+    """Does what was said."""
     action = self.networks.action(said, self._last)
     found = self.env.step(action)
     self._last = action * (1 - found[2])[:, None]
@@ -133,29 +117,18 @@ class Learner:
 
   def _begin(self, env: Exercises, seed: int) -> None:
     """Begins episodes in all worlds."""
-    self.env = RslRl(env, seed, self.networks.groups)
+    self.env = RslRl(env, seed, self.groups)
     self.networks.actor.reset()
     self._last = torch.zeros(self.env.num_envs, self.env.num_actions, device=self.env.device)
 
   def iterate(self, stop: Callable[[], bool] = lambda: False) -> dict[str, float] | None:
     """Learns from some steps of all worlds; returns `ROW`, or None if it was to stop."""
-    start, ppo, env = time.perf_counter(), self._ppo, self.env
+    start = time.perf_counter()
     ended: list[dict[str, torch.Tensor]] = []
-    with torch.inference_mode():
-      for _ in range(self._count):
-        if stop():
-          ppo.storage.clear()
-          return None
-        action = ppo.act(env.get_observations())
-        seen, reward, over, extras = self._step(action)
-        ppo.process_env_step(seen, reward, over, extras)
-        if extras["log"]:
-          ended.append(extras["log"])
-      ppo.compute_returns(env.get_observations())
-    success = float(env.won.mean())
-    self._update(success)
+    success = self._learn(ended, stop)
+    if success is None:
+      return None
     self.iteration += 1
-    self.steps += self._count * env.num_envs
     self.seconds += time.perf_counter() - start
 
     def mean(name: str) -> float:
@@ -165,22 +138,27 @@ class Learner:
       "iteration": self.iteration, "steps": self.steps, "seconds": self.seconds,
       "episodes": sum(len(each["/return"]) for each in ended), "success": success,
       "return": mean("/return"), "length": mean("/length"),
-      "spread": self.networks.spread, "learning_rate": ppo.learning_rate,
+      "spread": self.networks.spread, "learning_rate": self.rate,
     }  # fmt: skip
 
-  def _update(self, success: float) -> None:
-    ppo, networks, settings = self._ppo, self.networks, self.settings
-    ppo.learning_rate = max(ppo.learning_rate, _SLOWEST)
-    watching = networks.lessons and self.iteration < _WATCHING
-    kept = copy.deepcopy(networks.actor.state_dict()) if watching else None
-    ppo.update()
-    if kept is not None:
-      networks.actor.load_state_dict(kept)
-      ppo.learning_rate = settings.learning_rate
-    else:
-      networks.rehearse(ppo.learning_rate)
-    # The more often it succeeds, the less it tries: what acts in the end has no spread.
-    networks.calm(settings.spread ** (1 - success) * settings.calm**success)
+  def _learn(self, ended: list[dict[str, torch.Tensor]], stop: Callable[[], bool]) -> float | None:
+    """Learns from some steps and adds what ended; returns the share of successes."""
+    raise NotImplementedError
+
+  @property
+  def rate(self) -> float:
+    """Learning rate."""
+    return self.optimiser.param_groups[0]["lr"]
+
+  @rate.setter
+  def rate(self, value: float) -> None:
+    for group in self.optimiser.param_groups:
+      group["lr"] = value
+
+  @property
+  def modules(self) -> dict[str, torch.nn.Module]:
+    """What a checkpoint has of the networks, by name."""
+    return {"actor": self.networks.actor, "critic": self.networks.critic}
 
   def judge(self, stop: Callable[[], bool] = lambda: False) -> float:
     """Returns the share of successes without spread, of an episode in each world."""
@@ -205,7 +183,7 @@ class Learner:
   def policy(self, task: Any, task_kwargs: dict[str, Any]) -> policy.Policy:
     """Returns what was learned, for an exercise."""
     training = {
-      "algorithm": "PPO (rsl_rl)", "num_envs": self.env.num_envs, "iteration": self.iteration,
+      "algorithm": self.algorithm, "num_envs": self.env.num_envs, "iteration": self.iteration,
       "steps": self.steps, "seconds": round(self.seconds, 1), "lessons": self.networks.lessons,
       **dataclasses.asdict(self.settings),
     }  # fmt: skip
@@ -213,14 +191,14 @@ class Learner:
 
   def save(self, path: pathlib.Path, task: str) -> None:
     """Writes a checkpoint."""
-    ppo, tensors = self._ppo, {}
-    for name, module in (("actor", ppo.actor), ("critic", ppo.critic)):
+    tensors = {}
+    for name, module in self.modules.items():
       tensors |= {f"{name}/{key}": value for key, value in module.state_dict().items()}
-    for number, state in ppo.optimizer.state_dict()["state"].items():
+    for number, state in self.optimiser.state_dict()["state"].items():
       tensors |= {f"adam/{number}/{key}": torch.as_tensor(v) for key, v in state.items()}
     done = {
       "task": task, "iteration": self.iteration, "steps": self.steps, "seconds": self.seconds,
-      "learning_rate": ppo.learning_rate, "settings": dataclasses.asdict(self.settings),
+      "learning_rate": self.rate, "settings": dataclasses.asdict(self.settings),
     }  # fmt: skip
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     with replacing(path, "wb") as file:
@@ -236,24 +214,101 @@ class Learner:
       raise ValueError(f"{path}: {error}") from None
     if done.get("task") != task:
       raise ValueError(f"{path} is of {done.get('task', 'something else')}, not of {task}")
-    ppo = self._ppo
     try:
-      for name, module in (("actor", ppo.actor), ("critic", ppo.critic)):
+      for name, module in self.modules.items():
         module.load_state_dict(_below(tensors, f"{name}/"))
       state: dict[int, dict[str, torch.Tensor]] = {}
       for key, value in _below(tensors, "adam/").items():
         number, _, name = key.partition("/")
         state.setdefault(int(number), {})[name] = value
-      groups = ppo.optimizer.state_dict()["param_groups"]
-      ppo.optimizer.load_state_dict({"state": state, "param_groups": groups})
+      groups = self.optimiser.state_dict()["param_groups"]
+      self.optimiser.load_state_dict({"state": state, "param_groups": groups})
     except (RuntimeError, KeyError, ValueError) as error:
       raise ValueError(f"{path} does not fit these settings: {error}") from None
     self.iteration, self.steps, self.seconds = done["iteration"], done["steps"], done["seconds"]
-    ppo.learning_rate = done["learning_rate"]
-    for group in ppo.optimizer.param_groups:
-      group["lr"] = ppo.learning_rate
+    self.rate = done["learning_rate"]
     torch.manual_seed(self.settings.seed + self.iteration)
     self._begin(self.env.env, self.settings.seed + self.iteration * self.env.num_envs)
+
+
+class Learner(Student):
+  """Networks that practise an exercise."""
+
+  algorithm = "PPO (rsl_rl)"
+
+  def __init__(self, env: Exercises, settings: Settings, networks: Networks, seconds: float = 0.0):
+    """Begins, see `Student`; what networks have not been taught they find out here."""
+    super().__init__(env, settings, networks, seconds)
+    self._count = max(_SHORT, math.ceil(LEAST / env.num_envs))
+    seen, count = self.env.get_observations(), self.env.num_actions
+    storage = RolloutStorage(
+      "rl", env.num_envs, self._count, seen, [count], networks.device
+    )  # fmt: skip
+    self._ppo = PPO(
+      networks.actor, networks.critic, storage, device=networks.device,
+      num_learning_epochs=settings.epochs, num_mini_batches=settings.minibatches,
+      gamma=settings.gamma, lam=settings.lam, entropy_coef=settings.entropy,
+      learning_rate=settings.learning_rate,
+    )  # fmt: skip
+    self.optimiser = self._ppo.optimizer
+    self._ppo.train_mode()
+    networks.calm(settings.spread)
+    if not networks.lessons:
+      self._look()
+    self.env.stagger(torch.Generator().manual_seed(settings.seed))
+
+  @property
+  def rate(self) -> float:
+    """Learning rate, which follows the change of the policy."""
+    return self._ppo.learning_rate
+
+  @rate.setter
+  def rate(self, value: float) -> None:
+    self._ppo.learning_rate = value
+    for group in self.optimiser.param_groups:
+      group["lr"] = value
+
+  def _look(self) -> None:
+    """Learns how large observations are."""
+    seen = []
+    with torch.no_grad():
+      for _ in range(self._count):
+        seen.append(self.env.get_observations())
+        self._step(self.networks.actor(seen[-1], stochastic_output=True))
+    self.networks.actor.reset()
+    self.networks.normalise(torch.cat(seen))
+
+  def _learn(self, ended: list[dict[str, torch.Tensor]], stop: Callable[[], bool]) -> float | None:
+    ppo, env = self._ppo, self.env
+    with torch.inference_mode():
+      for _ in range(self._count):
+        if stop():
+          ppo.storage.clear()
+          return None
+        action = ppo.act(env.get_observations())
+        seen, reward, over, extras = self._step(action)
+        ppo.process_env_step(seen, reward, over, extras)
+        if extras["log"]:
+          ended.append(extras["log"])
+      ppo.compute_returns(env.get_observations())
+    success = float(env.won.mean())
+    self._update(success)
+    self.steps += self._count * env.num_envs
+    return success
+
+  def _update(self, success: float) -> None:
+    ppo, networks, settings = self._ppo, self.networks, self.settings
+    ppo.learning_rate = max(ppo.learning_rate, _SLOWEST)
+    watching = networks.lessons and self.iteration < _WATCHING
+    kept = copy.deepcopy(networks.actor.state_dict()) if watching else None
+    ppo.update()
+    if kept is not None:
+      networks.actor.load_state_dict(kept)
+      ppo.learning_rate = settings.learning_rate
+    else:
+      networks.rehearse(ppo.learning_rate)
+    # The more often it succeeds, the less it tries: what acts in the end has no spread.
+    networks.calm(settings.spread ** (1 - success) * settings.calm**success)
 
 
 def _below(tensors: dict[str, Any], prefix: str) -> dict[str, Any]:

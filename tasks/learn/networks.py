@@ -10,6 +10,7 @@ The critic sees all, and remembers nothing.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -24,6 +25,7 @@ from torch.nn.utils.rnn import pad_sequence
 from ..core.observation import ROWS
 from . import policy
 from .lessons import Lesson
+from .sight import PICTURES, Seeing
 
 HIDDEN = ("joint_vel", "drive", "tip_vel", "surface")  # from an actor that is taught
 ACTING, MORE = "acting", "more"  # groups of observations
@@ -31,7 +33,7 @@ CHANGES = ("jaw",)  # components that an actor says as changes: jaws close by an
 POWER = 2.0  # an action is what the actor says times its size: slow motion is as clear as fast
 CLONING = 700  # steps of the optimiser of a round
 _BATCH, _RATE = 32, 3e-3  # lessons of a step
-_FINE = 0.1  # errors above count by their size, not their square [-]
+FINE = 0.1  # errors above count by their size, not their square [-]
 _SELDOM = 0.01  # least mean size of a component: what is said seldom counts more [-]
 _LAST = 50  # steps of the optimiser that the error is a mean of
 _KNOWN = 0.05  # share of `_VARY` that is enough where lessons have shown the whole
@@ -42,10 +44,14 @@ _GATES = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")  # of torch, as a poli
 _STILL = 1e-6  # standard deviation of what has not changed, and may be anything
 
 
-def grouped(names: Sequence[str], taught: bool) -> dict[str, list[str]]:
-  """Returns what is observed in the groups of the networks."""
-  hidden = [name for name in names if taught and name.endswith(HIDDEN)]
-  found = {ACTING: [name for name in names if name not in hidden], MORE: hidden}
+def grouped(
+  names: Sequence[str], taught: bool, privileged: Sequence[str] = ()
+) -> dict[str, list[str]]:
+  """Returns what is observed in the groups of the networks; `privileged` is not to act by."""
+  seen = [name for name in names if name == policy.PIXELS]
+  hidden = [name for name in names if (taught and name.endswith(HIDDEN)) or name in privileged]
+  acting = [name for name in names if name not in (*hidden, *seen)]
+  found = {ACTING: acting, MORE: hidden, PICTURES: seen}
   return {group: chosen for group, chosen in found.items() if chosen}
 
 
@@ -69,6 +75,7 @@ class Networks:
     seed: int,
     device: str,
     taught: bool = True,
+    privileged: Sequence[str] = (),
   ):
     """Makes networks that know nothing.
 
@@ -81,9 +88,10 @@ class Networks:
       seed: of the weights, and of the order of what is learned
       device: of torch
       taught: whether there will be lessons
+      privileged: names of what the critic alone sees
     """
     torch.manual_seed(seed)
-    self.groups, self.device, self.lessons = grouped(list(shapes), taught), device, 0
+    self.groups, self.device, self.lessons = grouped(list(shapes), taught, privileged), device, 0
     self._shapes: dict[str, tuple[int, ...]] = dict(shapes)
     self._memory: Any = None
     self._components = list(components)
@@ -95,10 +103,12 @@ class Networks:
     )
     common = {"hidden_dims": list(hidden), "activation": "tanh", "obs_normalization": True}
     gaussian = {"class_name": "GaussianDistribution", "init_std": spread, "std_type": "log"}
-    sets = {"actor": [ACTING], "critic": list(self.groups)}
+    sets = {"actor": [ACTING], "critic": [g for g in self.groups if g != PICTURES]}
     recurrent: dict[str, Any] = {"rnn_type": "gru", "rnn_hidden_dim": memory}
     recurrent["distribution_cfg"], count = gaussian, len(components)
-    self.actor: Any = RNNModel(seen, sets, "actor", count, **recurrent, **common).to(device)
+    self.pixels = self._shapes[policy.PIXELS][:2] if PICTURES in self.groups else ()
+    kind: Any = functools.partial(Seeing, size=self.pixels) if self.pixels else RNNModel
+    self.actor: Any = kind(seen, sets, "actor", count, **recurrent, **common).to(device)
     self.critic: Any = MLPModel(seen, sets, "critic", 1, **common).to(device)
     self._last: Any = torch.optim.Adam(self._parts())
 
@@ -130,7 +140,7 @@ class Networks:
   def take(self, made: policy.Policy) -> None:
     """Begins with what a policy of another exercise does; ValueError says why it cannot."""
     for what, own, other in (
-      ("observes", self.groups[ACTING], made.about.observations),
+      ("observes", self._observed, (*made.about.observations, *_pictures(made.about.pixels))),
       ("moves", self._components, made.about.components),
     ):
       if list(own) != list(other):
@@ -138,9 +148,10 @@ class Networks:
     weights, (mean, std) = self.actor.state_dict(), (made.mean, 1.0 / made.scale)
     linear = [k.removesuffix(".weight") for k in weights if k.startswith("mlp") and "weight" in k]
     arrays = dict(zip([f"rnn.rnn.{gate}_l0" for gate in _GATES], made.memory or (), strict=False))
-    for name, (weight, bias) in zip(linear, made.layers, strict=False):
+    pairs = [*zip(linear, made.layers, strict=False), *self._encoder(made.encoder)]
+    for name, (weight, bias) in pairs:
       arrays |= {f"{name}.weight": weight, f"{name}.bias": bias}
-    known = {k: v for k, v in weights.items() if k.startswith(("rnn", "mlp"))}
+    known = {k: v for k, v in weights.items() if k.startswith(("rnn", "mlp", "encoder"))}
     if {k: v.shape for k, v in arrays.items()} != {k: tuple(v.shape) for k, v in known.items()}:
       raise ValueError("the policy is of another network")
     if made.about.power != POWER or made.about.changes != self._changes:
@@ -148,6 +159,16 @@ class Networks:
     for name, array in arrays.items():
       known[name].copy_(torch.from_numpy(array))
     self._scale(self.actor, *(torch.from_numpy(row).to(self.device) for row in (mean, std)))
+
+  @property
+  def _observed(self) -> list[str]:
+    return [*self.groups[ACTING], *_pictures(self.pixels)]
+
+  def _encoder(self, layers: Sequence[Any]) -> list[tuple[str, Any]]:
+    """Returns the layers of an encoder by their names in the actor."""
+    last = len(layers) - 1
+    names = [f"encoder.convolutions.{k}" if k < last else "encoder.head" for k in range(last + 1)]
+    return list(zip(names, layers, strict=True))
 
   def _least(self, names: Sequence[str]) -> torch.Tensor:
     """Returns how much each number that is observed varies at least."""
@@ -196,8 +217,11 @@ class Networks:
     self._memory = [self._read(lesson) for lesson in whole]
     every = torch.cat([each["seen"] for each in self._memory])
     self.normalise(every)
-    done = torch.cat([each["says"][each["taught"] > 0] for each in self._memory])
-    size = (done - done.median(dim=0).values).abs().mean(dim=0)
+    self.weigh(torch.cat([each["says"][each["taught"] > 0] for each in self._memory]))
+
+  def weigh(self, says: torch.Tensor) -> None:
+    """Learns how much each component of what is to be said varies  (n, naction)."""
+    size = (says - says.median(dim=0).values).abs().mean(dim=0)
     self._weights = 1.0 / (len(size) * size.clamp(min=_SELDOM))
 
   def _read(self, lesson: Lesson) -> TensorDict:
@@ -228,8 +252,11 @@ class Networks:
     """Returns how far the actor is from what was meant, each component by its size in lessons."""
     actor = self.actor
     latent, _ = actor.rnn.rnn(actor.obs_normalizer(some["seen"][ACTING]))
-    error = smooth_l1_loss(actor.mlp(latent), some["says"], beta=_FINE, reduction="none")
-    taught = some["taught"]
+    return self.error(latent, some["says"], some["taught"])
+
+  def error(self, latent: torch.Tensor, says: torch.Tensor, taught: torch.Tensor) -> torch.Tensor:
+    """Returns how far what the actor says by its memory is from what it should, where taught."""
+    error = smooth_l1_loss(self.actor.mlp(latent), says, beta=FINE, reduction="none")
     return ((error @ self._weights) * taught).sum() / taught.sum().clamp(min=1.0)
 
   def rehearse(self, rate: float) -> None:
@@ -268,7 +295,9 @@ class Networks:
     about = policy.About(
       task.name, tuple(task.components), self.groups[ACTING], task.control_timestep, POWER,
       self._changes, dict(task_kwargs), {"palpate": palpate.__version__, **training},
+      pixels=self.pixels,
     )  # fmt: skip
+    layers = self._encoder(self.actor.encoder.layers if self.pixels else [])
     memory: Any = tuple(weights[f"rnn.rnn.{name}_l0"] for name in _GATES)
     return policy.Policy(
       about,
@@ -276,14 +305,19 @@ class Networks:
       1.0 / (weights["obs_normalizer._std"][0] + self.actor.obs_normalizer.eps),
       [(weights[f"mlp.{k}.weight"], weights[f"mlp.{k}.bias"]) for k in linear],
       memory,
+      [(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name, _ in layers],
     )
+
+
+def _pictures(pixels: Sequence[int]) -> list[str]:
+  return [policy.PIXELS] if pixels else []
 
 
 def _rescale(model: Any, mean: torch.Tensor, std: torch.Tensor) -> None:
   """Changes the first weights of a network so that it says the same with another scale."""
   weight, bias = model.mlp[0].weight, model.mlp[0].bias
   if model.is_recurrent:
-    weight, bias = model.rnn.rnn.weight_ih_l0, model.rnn.rnn.bias_ih_l0
+    weight, bias = model.rnn.rnn.weight_ih_l0[:, : len(mean)], model.rnn.rnn.bias_ih_l0
   known = model.obs_normalizer.state_dict()
   with torch.no_grad():
     bias += weight @ ((mean - known["_mean"][0]) / known["_std"][0])

@@ -5,7 +5,10 @@
 
 A file is one of safetensors: a memory, which is a gated recurrent unit (Cho et al. 2014,
 10.48550/arXiv.1406.1078), a network of `tanh` layers above it, what the input is normalised by, and
-in the header as JSON the exercise, its action and what it observes. NumPy is enough to run it.
+in the header as JSON the exercise, its action and what it observes. A policy of pictures has an
+encoder too: convolutions whose last channels each say where in the picture they respond most and
+how much (spatial soft-argmax: Levine et al. 2016, 10.48550/arXiv.1504.00702), and a `tanh` layer.
+NumPy is enough to run it.
 """
 
 from __future__ import annotations
@@ -23,10 +26,13 @@ from ..files import replacing
 
 SUFFIX = ".safetensors"
 FILE = f"policy{SUFFIX}"  # in a folder of training
+PIXELS = "pixels"  # the picture that a policy may observe
 FOLDER = pathlib.Path(__file__).parents[1] / "policies"  # of those that come with exercises
 _KEY = "palpate"  # of the header
 _FORMAT = 2
 _DTYPES = ("F16", "F32", "F64")  # of arrays
+STRIDE = 2  # of the first convolution; the others have 1
+_ENCODER = "encoder_"  # before the names of its arrays
 _MEMORY = ("input", "state", "input_bias", "state_bias")  # arrays of a memory
 
 
@@ -37,7 +43,7 @@ class About:
   Attributes:
     task: such as "touch/easy"
     components: of the action
-    observations: names, in the order of the input
+    observations: names, in the order of the input, without pictures
     control_timestep: between actions [s]
     power: that the size of what the network says is raised to, which makes it exact where actions
       are small
@@ -45,6 +51,7 @@ class About:
     task_kwargs: options of the exercise it was trained with
     training: how it was made, for people
     licence: of the weights
+    pixels: height and width of the picture that it sees, empty for none [pixels]
   """
 
   task: str
@@ -56,6 +63,7 @@ class About:
   task_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
   training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
   licence: str = "Apache-2.0"
+  pixels: Sequence[int] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -69,6 +77,8 @@ class Policy:
     layers: weights (nout, nin) and biases (nout,)
     memory: weights of input (3 n, ninput) and state (3 n, n), biases of both (3 n,), in each the
       rows of the reset gate, the update gate and the new state; None for no memory
+    encoder: of pictures: weights (nout, nin, n, n) and biases (nout,) of convolutions, then those
+      of a layer (nout, 3 nin), whose output follows the normalised input; empty for none
   """
 
   about: About
@@ -76,6 +86,7 @@ class Policy:
   scale: np.ndarray
   layers: Sequence[tuple[np.ndarray, np.ndarray]]
   memory: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
+  encoder: Sequence[tuple[np.ndarray, np.ndarray]] = ()
 
   def begin(self, *count: int) -> Episode:
     """Returns who acts in an episode, or in `count` side by side, and remembers no others."""
@@ -90,12 +101,17 @@ class Policy:
       raise ValueError(f"the policy's action is {', '.join(about.components)}, expected "
                        f"{', '.join(task.components)}")  # fmt: skip
     spec = env.observation_spec()
-    missing = [name for name in about.observations if name not in spec]
+    seen = [PIXELS] if about.pixels else []
+    missing = [name for name in (*about.observations, *seen) if name not in spec]
     if missing:
       raise ValueError(f"the policy observes {', '.join(missing)}, which observations lack")
     count = sum(int(np.prod(spec[name].shape)) for name in about.observations)
     if count != len(self.mean):
       raise ValueError(f"the policy takes {len(self.mean)} numbers, the exercise has {count}")
+    for size in [spec[name].shape[:2] for name in seen]:
+      if tuple(size) != tuple(about.pixels):
+        raise ValueError(f"the policy sees {_by(about.pixels)} pixels, the exercise draws "
+                         f"{_by(size)}")  # fmt: skip
     if not np.isclose(env.control_timestep(), about.control_timestep):
       raise ValueError(f"the policy acts each {about.control_timestep:g} s, not each "
                        f"{env.control_timestep():g} s")  # fmt: skip
@@ -121,6 +137,8 @@ class Episode:
     names = policy.about.observations
     parts = [np.reshape(observation[name], (*self._count, -1)) for name in names]
     x = (np.concatenate(parts, axis=-1) - policy.mean) * policy.scale
+    if policy.encoder:
+      x = np.concatenate([x, encode(observation[PIXELS], policy.encoder)], axis=-1)
     if policy.memory:
       x = self._state = _remember(x, self._state, *policy.memory)
     for k, (weight, bias) in enumerate(policy.layers):
@@ -129,6 +147,32 @@ class Episode:
     said = np.sign(x) * np.abs(x) ** policy.about.power
     self.last = np.clip(said + self._adds * self.last, -1.0, 1.0)
     return self.last
+
+
+def encode(pixels: np.ndarray, layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+  """Returns what an encoder says of pictures (..., height, width, 3), see `Policy`  (..., nout)."""
+  *convolutions, (head, bias) = layers
+  x = np.asarray(pixels, np.float32) / 255.0 - 0.5
+  for k, (weight, shift) in enumerate(convolutions):
+    step = 1 if k else STRIDE
+    shape, x = weight.shape[2:], np.maximum(x, 0.0) if k else x
+    windows = np.lib.stride_tricks.sliding_window_view(x, shape, axis=(-3, -2))
+    windows = windows[..., ::step, ::step, :, :, :]  # (..., row, column, channel, n, n)
+    rows = windows.reshape(*windows.shape[:-3], -1)
+    x = rows @ weight.reshape(len(weight), -1).T + shift
+  height, width, count = x.shape[-3:]
+  flat = x.reshape(*x.shape[:-3], height * width, count)
+  most = flat.max(axis=-2, keepdims=True)
+  share = np.exp(flat - most)
+  total = share.sum(axis=-2)
+  y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
+  places = [(share * axis.reshape(-1, 1)).sum(axis=-2) / total for axis in (x, y)]
+  level = most[..., 0, :] + np.log(total / (height * width))
+  return np.tanh(np.concatenate([*places, level], axis=-1) @ head.T + bias)
+
+
+def _by(size: Sequence[int]) -> str:
+  return " x ".join(map(str, size))
 
 
 def _remember(x, state, weight, own, bias, own_bias) -> np.ndarray:
@@ -146,8 +190,9 @@ def save(path: str | os.PathLike[str], policy: Policy) -> None:
   from safetensors.numpy import save as dump
 
   arrays = dict(zip(_MEMORY, policy.memory or (), strict=False))
-  for k, (weight, bias) in enumerate(policy.layers):
-    arrays |= {f"weight{k}": weight, f"bias{k}": bias}
+  for name, layers in (("", policy.layers), (_ENCODER, policy.encoder)):
+    for k, (weight, bias) in enumerate(layers):
+      arrays |= {f"{name}weight{k}": weight, f"{name}bias{k}": bias}
   arrays = {name: np.asarray(array, np.float16) for name, array in arrays.items()}
   arrays |= {"mean": policy.mean.astype(np.float32), "scale": policy.scale.astype(np.float32)}
   about = json.dumps({"format": _FORMAT, **dataclasses.asdict(policy.about)})
@@ -180,10 +225,9 @@ def load(path: str | os.PathLike[str]) -> Policy:
     about = json.loads(header)
     if not isinstance(about, dict) or about.pop("format", None) != _FORMAT:
       raise ValueError("it is of another version")
-    count = sum(name.startswith("weight") for name in arrays)
-    layers = [(arrays[f"weight{k}"], arrays[f"bias{k}"]) for k in range(count)]
+    layers, encoder = (_layers(arrays, name) for name in ("", _ENCODER))
     memory: Any = tuple(arrays[name] for name in _MEMORY if name in arrays) or None
-    made = Policy(About(**about), arrays["mean"], arrays["scale"], layers, memory)
+    made = Policy(About(**about), arrays["mean"], arrays["scale"], layers, memory, encoder)
     _check_about(made.about)
     _check_shapes(made)
   except RecursionError:
@@ -193,12 +237,26 @@ def load(path: str | os.PathLike[str]) -> Policy:
   return made
 
 
-def shipped(task: str) -> Policy:
-  """Returns the policy that comes with an exercise; ValueError names those there are."""
-  path = FOLDER / f"{task.replace('/', '_')}{SUFFIX}"
+def _layers(arrays: Mapping[str, np.ndarray], name: str) -> list[tuple[np.ndarray, np.ndarray]]:
+  count = sum(key.startswith(f"{name}weight") for key in arrays)
+  return [(arrays[f"{name}weight{k}"], arrays[f"{name}bias{k}"]) for k in range(count)]
+
+
+def shipped(task: str, pictures: bool = False) -> Policy:
+  """Returns the policy that comes with an exercise; ValueError names those there are.
+
+  Args:
+    task: such as "touch/easy"
+    pictures: whether it sees pictures in place of the state
+  """
+  kind = f"_{PIXELS}" if pictures else ""
+  path = FOLDER / f"{task.replace('/', '_')}{kind}{SUFFIX}"
   if not path.exists():
-    have = ", ".join(sorted(found.stem.replace("_", "/", 1) for found in FOLDER.glob(f"*{SUFFIX}")))
-    raise ValueError(f"no trained policy comes with {task}, expected one of {have or 'none'}")
+    names = [found.stem for found in FOLDER.glob(f"*{SUFFIX}")]
+    names = [n.removesuffix(kind) for n in names if n.endswith(f"_{PIXELS}") == pictures]
+    have = ", ".join(sorted(name.replace("_", "/", 1) for name in names))
+    what = "policy of pictures" if pictures else "policy"
+    raise ValueError(f"no trained {what} comes with {task}, expected one of {have or 'none'}")
   return load(path)
 
 
@@ -215,6 +273,9 @@ def _check_about(about: About) -> None:
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (number and 0 < value < np.inf):
       raise ValueError(f"{name} is {value!r}, expected a finite number > 0")
+  size = about.pixels
+  if not isinstance(size, list | tuple) or not all(type(n) is int and n > 0 for n in size):
+    raise ValueError(f"pixels is {size!r}, expected height and width")
   for name in ("task_kwargs", "training"):
     if not isinstance(getattr(about, name), dict):
       raise ValueError(f"{name} is {getattr(about, name)!r}, expected options by name")
@@ -226,6 +287,7 @@ def _check_shapes(policy: Policy) -> None:
   size = len(policy.mean)
   if policy.scale.shape != (size,):
     raise ValueError(f"scale has shape {policy.scale.shape}, expected ({size},)")
+  size += _check_encoder(policy)
   if policy.memory:
     count = policy.memory[1].shape[-1]
     expected = [(3 * count, size), (3 * count, count), (3 * count,), (3 * count,)]
@@ -239,6 +301,28 @@ def _check_shapes(policy: Policy) -> None:
     size = len(bias)
   if not policy.layers or size != len(policy.about.components):
     raise ValueError(f"it ends in {size} numbers, expected {len(policy.about.components)}")
-  parts = (*policy.layers, policy.memory or (), (policy.mean, policy.scale))
+  parts = (*policy.layers, *policy.encoder, policy.memory or (), (policy.mean, policy.scale))
   if not all(np.isfinite(array).all() for part in parts for array in part):
     raise ValueError("its weights are not finite")
+
+
+def _check_encoder(policy: Policy) -> int:
+  """Returns how many numbers the encoder says, 0 without one."""
+  if bool(policy.encoder) != bool(policy.about.pixels):
+    have = f"{len(policy.encoder)} layers see them"
+    raise ValueError(f"pixels is {policy.about.pixels!r}, but {have}")
+  if not policy.encoder:
+    return 0
+  *convolutions, (head, bias) = policy.encoder
+  size, channels = np.array(policy.about.pixels), 3
+  for k, (weight, shift) in enumerate(convolutions):
+    if weight.ndim != 4 or weight.shape[:2] != (len(shift), channels):
+      expected = f"({len(shift)}, {channels}, n, n)"
+      raise ValueError(f"{_ENCODER}weight{k} has shape {weight.shape}, expected {expected}")
+    size, channels = (size - weight.shape[2:]) // (1 if k else STRIDE) + 1, len(shift)
+  if len(size) != 2 or not convolutions or size.min() < 1:
+    raise ValueError(f"pixels is {policy.about.pixels!r}, too few for the encoder")
+  if head.shape != (len(bias), 3 * channels):
+    last = f"{_ENCODER}weight{len(convolutions)}"
+    raise ValueError(f"{last} has shape {head.shape}, expected ({len(bias)}, {3 * channels})")
+  return len(bias)

@@ -62,6 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--seed", metavar="N", type=int, default=0, help="of the first episode (%(default)s)")
   workers.add_arguments(parser, 1)
   options.add_argument(parser)
+  options.add_observations(parser)
   keeping.add_references(parser)
   add("--json", metavar="FILE", help="write every episode's metrics")
   add("--recordings", metavar="FOLDER", help="save the recording of every episode, complete or not")
@@ -83,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
   file = output("json", args.json) if args.json else None
   if args.recordings:
     output_folder("recordings", args.recordings)
-  task_kwargs = options.read(args.set)
+  task_kwargs = options.read(args.set, args.observations)
   if task_kwargs or trained:  # what is wrong with them is said once
     env = options.environment(name, json.dumps(task_kwargs))
     try:

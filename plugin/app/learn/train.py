@@ -28,10 +28,12 @@ from ..console import (
 from .teaching import LESSONS, LINES, School
 
 if TYPE_CHECKING:
-  from palpate.tasks.learn.learning import Learner
+  from palpate.tasks.learn.learning import Student
+  from palpate.tasks.learn.policy import Policy
 
 _FEW = 16  # worlds on a CPU
-_MANY = 4096  # on a GPU
+_MANY, _SEEING = 4096, 512  # on a GPU, and where pictures are drawn
+_TRAINED = "trained"  # the teacher that comes with an exercise
 _SAVE = 60.0  # seconds between checkpoints
 ROUNDS = 6  # of lessons, at most
 _LESSONS = 96  # of a round
@@ -52,6 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser):
     "--lessons", metavar="N", type=int, default=_LESSONS,
     help=f"of an expert, in each of {ROUNDS} rounds at most (%(default)s); 0 for practice alone",
   )  # fmt: skip
+  add(
+    "--teacher", metavar="FILE", default=_TRAINED,
+    help="of a policy of pictures: the policy of the state that it learns from (%(default)s)",
+  )  # fmt: skip
   add("--from", metavar="FILE", dest="start", help="start from the policy of an easier exercise")
   add("--iterations", metavar="N", type=int, default=1000, help="of practice (%(default)s)")
   add(
@@ -65,6 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--resume", action="store_true", help="continue with the files of the folder")
   workers.add_arguments(parser, os.cpu_count() or 1)
   options.add_argument(parser)
+  options.add_observations(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -100,10 +107,11 @@ class Training:
   def __init__(self, name: str, args: argparse.Namespace, folder: pathlib.Path):
     """Makes the networks, or takes up what the folder has of them."""
     import warp as wp
+    from palpate.tasks.core import observation
     from palpate.tasks.learn import learning, networks, policy
 
     self.name, self.args, self.folder = name, args, folder
-    self.kwargs: dict[str, Any] = options.read(args.set)
+    self.kwargs: dict[str, Any] = options.read(args.set, args.observations)
     self.device = args.device or ("cuda:0" if wp.is_cuda_available() else "cpu")
     for path in (folder / learning.CHECKPOINT, folder / LESSONS):
       if path.exists() and not args.resume:
@@ -112,16 +120,21 @@ class Training:
     if args.resume and not (self.school.rounds or (folder / learning.CHECKPOINT).exists()):
       raise CommandError(f"out has no {learning.CHECKPOINT} to go on with")
     begun = (folder / learning.CHECKPOINT).exists()
-    taught = bool(self.school.rounds or (args.lessons and not begun))
-    self.settings = learning.Settings(seed=args.seed, **(learning.TAUGHT if taught else {}))
     single: Any = options.environment(name, self.school.task_kwargs)
-    self.task, spec = single.task, single.observation_spec()
-    if self.task.observed.pictures:
-      raise CommandError(f"{name}: observations has a picture, expected numbers alone")
+    self.teacher, self.told = self._find_teacher(single.task), json.dumps(self.kwargs)
+    taught = bool(self.teacher or self.school.rounds or (args.lessons and not begun))
+    self.settings = learning.Settings(seed=args.seed, **(learning.TAUGHT if taught else {}))
+    self.task, spec, privileged = single.task, dict(single.observation_spec()), []
+    if self.teacher:
+      self.kwargs["observations"] = [*observation.GROUPS, policy.PIXELS]
+      single = options.environment(name, json.dumps({**self.kwargs, "surroundings": "unseen"}))
+      privileged = [n for n in self.teacher.about.observations if n not in spec]
+      spec |= {name: single.observation_spec()[name] for name in privileged}
     device = "cpu" if self.device == "cpu" else str(wp.device_to_torch(self.device))
     self.networks = networks.Networks(
       {key: tuple(spec[key].shape) for key in spec}, self.task.components,
       self.settings.memory, self.settings.hidden, self.settings.spread, args.seed, device, taught,
+      privileged,
     )  # fmt: skip
     if self.school.rounds:
       self.networks.remember(self.school.lessons)
@@ -133,12 +146,30 @@ class Training:
         raise CommandError(f"from: {error}") from None
       self._write_taught()
 
+  def _find_teacher(self, task: Any) -> Policy | None:
+    """Returns who teaches a policy of pictures, None where numbers alone are observed."""
+    from palpate.tasks.learn import policy
+
+    names = task.observed.names
+    if not task.observed.pictures:
+      return None
+    if set(names) != {"sensors", policy.PIXELS}:
+      raise CommandError(
+        f"{self.name}: observations is {','.join(names)}, expected sensors,{policy.PIXELS} or "
+        "numbers alone"
+      )
+    try:
+      given = self.args.teacher
+      return policy.shipped(self.name) if given == _TRAINED else policy.load(given)
+    except ValueError as error:
+      raise CommandError(f"teacher: {error}") from None
+
   def teach(self, crew: workers.Workers, interrupt: Interrupt) -> bool:
     """Lets the expert teach; returns whether it was to the end."""
     from palpate.tasks.learn import learning
 
     school, networks = self.school, self.networks
-    if (self.folder / learning.CHECKPOINT).exists():  # it practises already
+    if self.teacher or (self.folder / learning.CHECKPOINT).exists():  # it practises already
       return True
     count, gamma, until = self.args.lessons, self.settings.gamma, 60 * self.args.minutes
     while count and school.rounds < ROUNDS and not school.enough and school.seconds < until:
@@ -181,19 +212,19 @@ class Training:
         last = learner.seconds
         self._save(learner, rows)
     progress.clear()
-    if rows or not self.school.rounds:
+    if rows or not (self.school.rounds or self.teacher):
       self._save(learner, rows)
     if rows:
       print(_line(rows[-1]))
     return not interrupt.seen
 
-  def _learner(self) -> Learner | None:
-    """Returns who practises, None where an exercise can only be taught."""
+  def _learner(self) -> Student | None:
+    """Returns who learns in many worlds, None where an exercise can only be taught."""
     from palpate.tasks.batch import vector
-    from palpate.tasks.learn import learning
+    from palpate.tasks.learn import distillation, learning
 
-    path = self.folder / learning.CHECKPOINT
-    count = self.args.num_envs or (_FEW if self.device == "cpu" else _MANY)
+    path, most = self.folder / learning.CHECKPOINT, _SEEING if self.teacher else _MANY
+    count = self.args.num_envs or (_FEW if self.device == "cpu" else most)
     try:
       env = vector.Exercises(count, self.name, device=self.device, output="torch", **self.kwargs)
     except vector.NotVectorisedError as error:
@@ -204,7 +235,13 @@ class Training:
     except (ValueError, TypeError) as error:
       raise CommandError(str(error)) from None
     try:
-      learner = learning.Learner(env, self.settings, self.networks, self.school.seconds)
+      if self.teacher:
+        limits = self.args.iterations, 60 * self.args.minutes
+        learner = distillation.Distillation(
+          env, self.settings, self.networks, self.teacher, *limits
+        )
+      else:
+        learner = learning.Learner(env, self.settings, self.networks, self.school.seconds)
       if path.exists():
         learner.load(path, self.name)
     except ValueError as error:
@@ -212,9 +249,9 @@ class Training:
     return learner
 
   def _told(self) -> dict[str, Any]:
-    return json.loads(json.dumps(self.kwargs))
+    return json.loads(self.told)
 
-  def _save(self, learner: Learner, rows: list[dict[str, float]]) -> None:
+  def _save(self, learner: Student, rows: list[dict[str, float]]) -> None:
     """Writes checkpoint, policy, licence and curves."""
     from palpate.tasks.learn import learning, policy
 
@@ -231,7 +268,7 @@ class Training:
 
 
 def _enough(
-  args: argparse.Namespace, learner: Learner, rows: list, stop: Callable[[], bool]
+  args: argparse.Namespace, learner: Student, rows: list, stop: Callable[[], bool]
 ) -> bool:
   if learner.iteration >= args.iterations or learner.seconds >= 60 * args.minutes:
     return True

@@ -1,0 +1,178 @@
+# pyright: reportMissingImports=false
+"""Distillation: a policy of pictures learns in many worlds from one that sees the state.
+
+The teacher says in every world what it would do, whoever acts: in a share of the worlds the student
+alone, elsewhere both by turns (Ross, Gordon and Bagnell 2011, 10.48550/arXiv.1011.0686; a teacher
+that sees more: Chen et al. 2019, 10.48550/arXiv.1912.12294). The student's memory has to tell what
+the teacher sees and it does not, too: so its encoder learns where to look long before it acts well.
+"""
+
+from __future__ import annotations
+
+import collections
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch.nn.functional import smooth_l1_loss
+
+from ..batch.vector import Exercises
+from . import policy
+from .learning import Settings, Student
+from .networks import ACTING, FINE, MORE, Networks
+from .sight import PICTURES
+
+TEACHER = "teacher"  # group of observations
+STEPS = 64  # control steps of an iteration
+UPDATES, WORLDS = 32, 64  # steps of the optimiser of an iteration, and worlds of each
+_KEPT = 4  # iterations that are learned from
+_ALONE = 1 / 3  # share of worlds where the student acts alone, once it acts
+_TURN = 40  # control steps of a turn elsewhere, in the mean
+_ACTS, _LEAST = 0.4, 0.2  # share of the training after which the teacher acts least, and how often
+_RATE, _SLOWEST = 1e-3, 0.03  # learning rate, and share of it at the end
+
+
+class Distillation(Student):
+  """Networks that learn from a teacher what pictures show."""
+
+  algorithm = "distillation"
+
+  def __init__(
+    self,
+    env: Exercises,
+    settings: Settings,
+    networks: Networks,
+    teacher: policy.Policy,
+    iterations: int,
+    seconds: float = math.inf,
+  ):
+    """Begins episodes in an environment that observes the groups and the picture.
+
+    Args:
+      env: many worlds of the exercise
+      settings: how to learn
+      networks: that learn; `privileged` are what the teacher alone observes
+      teacher: a policy of the same exercise
+      iterations: of the training
+      seconds: that it takes, at most
+    """
+    self._names, self._most = list(teacher.about.observations), (max(iterations, 1), seconds)
+    space: Any = env.single_observation_space
+    device = networks.device
+    sizes = {name: math.prod(space[name].shape) for name in networks.groups[MORE]}
+    shapes = {name: space[name].shape for name in self._names}
+    layers = [len(bias) for _, bias in teacher.layers]
+    made = Networks(
+      shapes, env.task.components, teacher.layers[0][0].shape[1], layers[:-1], 1.0,
+      settings.seed, device,
+    )  # fmt: skip
+    made.take(teacher)
+    self._teacher = made.actor
+    super().__init__(env, settings, networks)
+    self._guess = torch.nn.Linear(settings.memory, sum(sizes.values())).to(device)
+    share = [1.0 / (len(sizes) * size) for size in sizes.values() for _ in range(size)]
+    self._share = torch.tensor(share, device=device)
+    parts = [networks.actor.encoder, networks.actor.rnn, networks.actor.mlp, self._guess]
+    self.optimiser = torch.optim.Adam([p for part in parts for p in part.parameters()], _RATE)
+    self._kept: collections.deque[dict[str, Any]] = collections.deque(maxlen=_KEPT)
+    self._random = torch.Generator(device).manual_seed(settings.seed)
+    self._alone = torch.arange(self.env.num_envs, device=device) < _ALONE * self.env.num_envs
+    self._helped = torch.ones_like(self._alone)
+    self.env.stagger(torch.Generator().manual_seed(settings.seed))
+
+  @property
+  def groups(self) -> Mapping[str, Sequence[str]]:
+    """See `Student`."""
+    return {**self.networks.groups, TEACHER: self._names}
+
+  @property
+  def modules(self) -> dict[str, torch.nn.Module]:
+    """See `Student`."""
+    return {**super().modules, "guess": self._guess}
+
+  @property
+  def _done(self) -> float:
+    """Share of the training that is done."""
+    return min(max(self.iteration / self._most[0], self.seconds / self._most[1]), 1.0)
+
+  def _begin(self, env: Exercises, seed: int) -> None:
+    super()._begin(env, seed)
+    self._teacher.reset()
+
+  def _learn(self, ended: list[dict[str, torch.Tensor]], stop: Callable[[], bool]) -> float | None:
+    part = self._collect(ended, stop)
+    if part is None:
+      return None
+    self._kept.append(part)
+    if not self.iteration:
+      seen = {group: part[group].flatten(0, 1) for group in (ACTING, MORE)}
+      self.networks.normalise(TensorDict(seen, [len(seen[ACTING])]))
+    if len(self._kept) == 1:
+      self.networks.weigh(part["says"].flatten(0, 1))
+    self.rate = _RATE * max(0.5 + 0.5 * math.cos(math.pi * self._done), _SLOWEST)
+    for _ in range(UPDATES):
+      self._update()
+    self.steps += STEPS * self.env.num_envs
+    return float(self.env.won[self._alone].mean())
+
+  @torch.no_grad()
+  def _collect(self, ended: list, stop: Callable[[], bool]) -> dict[str, torch.Tensor] | None:
+    """Returns what was seen in some steps of all worlds, and what the teacher said."""
+    env, actor = self.env, self.networks.actor
+    helps = max(1.0 - (1.0 - _LEAST) * self._done / _ACTS, _LEAST)
+    rows: dict[str, list[torch.Tensor]] = collections.defaultdict(list)
+    state = actor.get_hidden_state()
+    size = env.num_envs, self.settings.memory
+    first = torch.zeros(size, device=env.device) if state is None else state[0].clone()
+    begun = torch.zeros(env.num_envs, device=env.device)
+    for _ in range(STEPS):
+      if stop():
+        return None
+      seen = env.get_observations()
+      says = self._teacher(TensorDict({ACTING: seen[TEACHER]}, batch_size=[env.num_envs]))
+      said = torch.where(self._helped[:, None], says, actor(seen)) if self.iteration else says
+      row = {group: seen[group] for group in (ACTING, PICTURES, MORE)}
+      for name, value in {**row, "says": says.clamp(-1.0, 1.0), "begun": begun}.items():
+        rows[name].append(value)
+      _, _, over, extras = self._step(said)
+      begun = over.float()
+      for each in (actor, self._teacher):
+        each.reset(over)
+      if extras["log"]:
+        ended.append(extras["log"])
+      drawn = torch.rand(2, env.num_envs, generator=self._random, device=env.device)
+      again = over.bool() | (drawn[0] < 1 / _TURN)
+      self._helped = torch.where(again, drawn[1] < helps, self._helped)
+      if self.iteration and self._done > _ACTS / 2:
+        self._helped &= ~self._alone
+    return {name: torch.stack(values) for name, values in rows.items()} | {"state": first}
+
+  def _update(self) -> None:
+    """Takes a step of the optimiser, by some worlds of an iteration."""
+    which, device = int(torch.randint(len(self._kept), ())), self.env.device
+    count = self.env.num_envs
+    worlds = torch.randint(count, (min(WORLDS, count),), generator=self._random, device=device)
+    part = {name: rows[:, worlds] for name, rows in self._kept[which].items() if name != "state"}
+    networks, actor = self.networks, self.networks.actor
+    latent = self._remember(part, self._kept[which]["state"][worlds])
+    error = networks.error(latent, part["says"], torch.ones_like(part["begun"]))
+    known = networks.critic.obs_normalizer(torch.cat([part[ACTING], part[MORE]], dim=-1))
+    more = known[..., part[ACTING].shape[-1] :].clamp(-10.0, 10.0)
+    guess = smooth_l1_loss(self._guess(latent), more, beta=FINE, reduction="none")
+    loss = error + (guess @ self._share).mean()
+    self.optimiser.zero_grad()
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_([p for p in actor.parameters() if p.grad is not None], 1.0)
+    self.optimiser.step()
+
+  def _remember(self, part: Mapping[str, torch.Tensor], state: torch.Tensor) -> torch.Tensor:
+    """Returns the actor's memory in each step, beginning with a state; an episode has its own."""
+    gru, told = self.networks.actor.rnn.rnn, self.networks.actor.sense(part)
+    weights = gru.weight_ih_l0, gru.weight_hh_l0, gru.bias_ih_l0, gru.bias_hh_l0
+    states = []
+    for x, begun in zip(told, part["begun"], strict=True):
+      state = torch.gru_cell(x, state * (1.0 - begun)[:, None], *weights)
+      states.append(state)
+    return torch.stack(states)

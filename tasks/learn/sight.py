@@ -1,0 +1,91 @@
+# pyright: reportMissingImports=false
+"""An actor that sees: what an encoder says of a picture goes into the memory beside the sensors.
+
+The encoder keeps places: a spatial soft-argmax says of each feature where in the picture it is
+(Levine et al. 2016, 10.48550/arXiv.1504.00702). `policy.encode` is the same in NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from rsl_rl.models import RNNModel
+from rsl_rl.modules import RNN
+from tensordict import TensorDict
+from torch import nn
+
+from .policy import STRIDE
+
+PICTURES = "pictures"  # group of observations
+CHANNELS, KERNELS = (16, 32, 32), (5, 3, 3)  # of the convolutions
+# Factors on the first weights: a feature is somewhere, not everywhere, from the start.
+_CONTRAST = {0: 6.0, len(KERNELS) - 1: 4.0}
+SAID = 64  # numbers that the encoder says
+
+
+class Encoder(nn.Module):
+  """What is seen where in a picture."""
+
+  def __init__(self, size: Sequence[int]):
+    """Makes an encoder of pictures of a height and width [pixels]."""
+    super().__init__()
+    self.size = tuple(size)
+    channels = zip((3, *CHANNELS), CHANNELS, KERNELS, strict=False)
+    self.convolutions = nn.ModuleList(
+      nn.Conv2d(*sizes, stride=1 if k else STRIDE) for k, sizes in enumerate(channels)
+    )
+    for k, layer in enumerate(self.convolutions):
+      nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+      layer.weight.data *= _CONTRAST.get(k, 1.0)
+      nn.init.zeros_(layer.bias)
+    self.head = nn.Linear(3 * CHANNELS[-1], SAID)
+
+  @property
+  def layers(self) -> list[Any]:
+    """The layers as `policy.Policy` has them."""
+    return [*self.convolutions, self.head]
+
+  def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+    """Returns what it says of pictures (..., 3 height width) of bytes  (..., SAID)."""
+    x = pixels.reshape(-1, *self.size, 3).permute(0, 3, 1, 2).float() / 255.0 - 0.5
+    for k, layer in enumerate(self.convolutions):
+      x = layer(x.relu() if k else x)
+    height, width = x.shape[2:]
+    flat = x.flatten(2)
+    share = flat.softmax(dim=2)
+    axes = [torch.linspace(-1.0, 1.0, n, device=x.device) for n in (width, height)]
+    across, down = axes[0].repeat(height), axes[1].repeat_interleave(width)
+    level = flat.logsumexp(dim=2) - torch.log(torch.tensor(float(height * width)))
+    said = self.head(torch.cat([share @ across, share @ down, level], dim=1)).tanh()
+    return said.reshape(*pixels.shape[:-1], SAID)
+
+
+class Seeing(RNNModel):
+  """A recurrent actor with an encoder."""
+
+  def __init__(
+    self,
+    seen: TensorDict,
+    sets: Mapping[str, Sequence[str]],
+    name: str,
+    count: int,
+    size: Sequence[int],
+    **options: Any,
+  ):
+    """Makes the actor; arguments as of `RNNModel`, and the height and width of pictures."""
+    super().__init__(seen, dict(sets), name, count, **options)  # pyright: ignore
+    self.encoder = Encoder(size)
+    self.rnn = RNN(self.obs_dim + SAID, self.latent_dim, type="gru")
+
+  def sense(self, seen: TensorDict) -> torch.Tensor:
+    """Returns what goes into the memory  (..., n)."""
+    flat = torch.cat([seen[group] for group in self.obs_groups], dim=-1)
+    return torch.cat([self.obs_normalizer(flat), self.encoder(seen[PICTURES])], dim=-1)
+
+  def get_latent(
+    self, obs: TensorDict, masks: torch.Tensor | None = None, hidden_state: Any = None
+  ) -> torch.Tensor:
+    """See `RNNModel`."""
+    return self.rnn(self.sense(obs), masks, hidden_state).squeeze(0)
