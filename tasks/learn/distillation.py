@@ -113,7 +113,7 @@ class Distillation(Student):
       self.networks.weigh(part["says"].flatten(0, 1))
     self.rate = _RATE * max(0.5 + 0.5 * math.cos(math.pi * self._done), _SLOWEST)
     for _ in range(UPDATES):
-      self._update()
+      self.update()
     self.steps += STEPS * self.env.num_envs
     return float(self.env.won[self._alone].mean())
 
@@ -149,8 +149,8 @@ class Distillation(Student):
         self._helped &= ~self._alone
     return {name: torch.stack(values) for name, values in rows.items()} | {"state": first}
 
-  def _update(self) -> None:
-    """Takes a step of the optimiser, by some worlds of an iteration."""
+  def update(self) -> float:
+    """Takes a step of the optimiser, by some worlds of an iteration; returns the error."""
     which, device = int(torch.randint(len(self._kept), ())), self.env.device
     count = self.env.num_envs
     worlds = torch.randint(count, (min(WORLDS, count),), generator=self._random, device=device)
@@ -166,6 +166,7 @@ class Distillation(Student):
     loss.backward()
     torch.nn.utils.clip_grad_norm_([p for p in actor.parameters() if p.grad is not None], 1.0)
     self.optimiser.step()
+    return float(loss.detach())
 
   def _remember(self, part: Mapping[str, torch.Tensor], state: torch.Tensor) -> torch.Tensor:
     """Returns the actor's memory in each step, beginning with a state; an episode has its own."""

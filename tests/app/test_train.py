@@ -11,7 +11,8 @@ for name in ("gymnasium", "torch", "rsl_rl", "safetensors"):
 
 import torch  # noqa: E402
 from palpate.tasks.batch import vector  # noqa: E402
-from palpate.tasks.learn import learning, networks, policy, rsl  # noqa: E402
+from palpate.tasks.core import observation  # noqa: E402
+from palpate.tasks.learn import distillation, learning, networks, policy, rsl  # noqa: E402
 from palpate.tasks.learn.lessons import Lesson  # noqa: E402
 
 SMALL = ["--device", "cpu", "--num-envs", "2", "--processes", "1", "--set", "time_limit=0.4"]
@@ -81,7 +82,7 @@ def test_an_expert_teaches_before_practice(tmp_path, capsys):
   capsys.readouterr()
   words = ["train", "touch/easy", "-o", str(tmp_path / "b"), *SMALL, "--set", VARIED]
   assert cli.main([*words, "--lessons", "1"]) == 0
-  assert "taught, not practised: touch/easy: randomise is given" in capsys.readouterr().err
+  assert "taught, not practised: touch/easy: randomise has 'stiffness'" in capsys.readouterr().err
 
 
 def test_lessons_begin_with_the_policy_of_an_easier_exercise(tmp_path, capsys):
@@ -95,6 +96,49 @@ def test_lessons_begin_with_the_policy_of_an_easier_exercise(tmp_path, capsys):
   capsys.readouterr()
   assert cli.main(["train", "grasp/easy", "-o", str(tmp_path / "c"), *words]) == 2
   assert "from: the policy observes joints" in capsys.readouterr().err
+
+
+PICTURES = ["--observations", "sensors,pixels", "--set", "pixels=[24,32]"]
+
+
+def test_a_policy_of_pictures_learns_from_one_of_the_state_and_is_evaluated(
+  tmp_path, capsys, monkeypatch
+):
+  monkeypatch.setattr(distillation, "STEPS", 8)
+  monkeypatch.setattr(distillation, "UPDATES", 2)
+  folder = tmp_path / "a"
+  assert train(folder, *PICTURES, "--iterations", "1") == 0
+  assert train(folder, *PICTURES, "--iterations", "3", "--resume") == 0
+  assert [row["iteration"] for row in rows(folder)] == [1, 2, 3]
+  about = policy.load(folder / "policy.safetensors").about
+  assert tuple(about.pixels) == (24, 32) and about.training["algorithm"] == "distillation"
+  assert not {"target", "progress", "nodes_near", "tip_vel"} & set(about.observations)
+  capsys.readouterr()
+  words = ["evaluate", "touch/easy", "--policy", str(folder / "policy.safetensors")]
+  words += ["--episodes", "1", "--set", "time_limit=0.1"]
+  assert cli.main(words) == 0  # it draws what the policy sees
+  assert "time limit 1" in capsys.readouterr().out
+  assert cli.main([*words, "--set", "pixels=[32,32]"]) == 2
+  assert "sees 24 x 32 pixels, the exercise draws 32 x 32" in capsys.readouterr().err
+
+
+def test_what_the_teacher_says_is_learned_from_pictures(monkeypatch):
+  monkeypatch.setattr(distillation, "STEPS", 12)
+  monkeypatch.setattr(distillation, "UPDATES", 1)
+  teacher = policy.shipped("touch/easy")
+  options = dict(observations=["sensors", "state", "pixels"], pixels=(24, 24))
+  env = vector.Exercises(4, "touch/easy", device="cpu", output="torch", **options)
+  space, settings = env.single_observation_space, learning.Settings()
+  privileged = [n for n in teacher.about.observations if n not in observation.ROWS] + ["progress"]
+  shapes = {n: space[n].shape for n in (*teacher.about.observations, "pixels")}
+  made = networks.Networks(
+    shapes, env.task.components, settings.memory, settings.hidden, 0.1, 0, "cpu", True, privileged
+  )
+  found = distillation.Distillation(env, settings, made, teacher, 1)
+  found.iterate()
+  errors = [found.update() for _ in range(30)]
+  assert sum(errors[-5:]) < 0.5 * sum(errors[:5])
+  env.close()
 
 
 def test_networks_take_up_a_policy_and_keep_it_where_observations_vary_otherwise():
@@ -159,12 +203,14 @@ def test_the_curve_counts_the_last_whole_episode_of_each_world():
 
 def test_what_is_wrong_is_said_before_the_work(tmp_path, capsys):
   (tmp_path / "checkpoint.safetensors").write_bytes(b"?")
+  new = str(tmp_path / "new")
   for words, said in (
     (["touch/easy", "-o", str(tmp_path)], "expected --resume or another folder"),
     (["touch/easy", "-o", str(tmp_path / "new"), "--resume"], "to go on with"),
     (["touch/easy", "-o", str(tmp_path), "--resume", "--num-envs", "1"], "checkpoint.safetensors"),
-    (["touch/easy", "-o", str(tmp_path / "new"), "--lessons", "0", "--set", VARIED], "is given"),
-    (["touch/easy", "-o", str(tmp_path / "new"), "--num-envs", "0"], "num_envs is 0"),
+    (["touch/easy", "-o", new, "--lessons", "0", "--set", VARIED], "randomise has"),
+    (["touch/easy", "-o", new, "--num-envs", "0"], "num_envs is 0"),
+    (["touch/easy", "-o", new, "--observations", "state,pixels"], "expected sensors,pixels"),
     (["sew/easy", "-o", str(tmp_path / "new")], "task is 'sew/easy'"),
   ):
     assert cli.main(["train", *words, "--device", "cpu"]) == 2

@@ -10,7 +10,7 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.vector import AutoresetMode  # noqa: E402
 from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
 from palpate.tasks import registry  # noqa: E402
-from palpate.tasks.core import performer  # noqa: E402
+from palpate.tasks.core import performer, scenes  # noqa: E402
 
 # float32 of the batch against float64, of either hand; jaws on a fold of tissue magnify it.
 LIMITS = {"contact_force": 0.02, "shaft_force": 0.02, "peak_force": 0.02, "gripper": 0.1}
@@ -351,6 +351,24 @@ def test_pictures_are_those_of_the_single_environment():
   assert shown.shape == (24, 32, 3) and np.ptp(shown) > 20
   with pytest.raises(ValueError, match="world is 2, expected one in"):
     envs.unwrapped.render([2])
+
+
+def test_a_curve_is_marked_where_to_begin_and_no_longer_where_it_is_traced():
+  seen = dict(observations=["segmentation"], pixels=(84, 84), surroundings="none")
+  env, envs = single("trace/easy", **seen), make("trace/easy", 1, **seen)
+  found, expected = envs.reset(seed=0)[0], env.reset(seed=0)[0]
+  many, few = (int((seen["segmentation"] == 3).sum()) for seen in (found, expected))
+  assert few > 20 and abs(many - few) <= 3
+  task, physics = env.unwrapped.environment.task, env.unwrapped.environment.physics
+  for traced, least, most in ((0.0, 30, 30), (0.5, 13, 17)):
+    task.traced = traced * task.arc[-1]
+    task.show(physics)
+    marks = physics.model.site_rgba[physics.target_sites]
+    left = np.flatnonzero(marks[:, 3] > 0)
+    yellow = np.isclose(marks[left, :3], scenes.NOW, atol=1e-6).all(axis=1)
+    assert least <= len(left) <= most and left[-1] == 29
+    assert yellow[0] and not yellow[1:].any()
+  envs.close()
 
 
 def test_what_pictures_show_is_drawn_for_every_world_as_in_the_single_environment():

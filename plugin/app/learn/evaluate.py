@@ -78,13 +78,14 @@ def main(args: argparse.Namespace) -> int:
   known = keeping.references(args.references)
   name = options.task_name(args.task)
   try:
-    trained = performer.is_policy(performer.find(args.policy))
+    found = performer.find(args.policy)
+    trained = performer.is_policy(found)
   except ValueError as error:
     raise CommandError(str(error)) from None
   file = output("json", args.json) if args.json else None
   if args.recordings:
     output_folder("recordings", args.recordings)
-  task_kwargs = options.read(args.set, args.observations)
+  task_kwargs = _seen(found) | options.read(args.set, args.observations)
   if task_kwargs or trained:  # what is wrong with them is said once
     env = options.environment(name, json.dumps(task_kwargs))
     try:
@@ -109,6 +110,12 @@ def main(args: argparse.Namespace) -> int:
   if errors:
     raise CommandError(f"{len(errors)} episodes failed, the first: {errors[0].error}", code=1)
   return 0
+
+
+def _seen(found: Any) -> dict[str, Any]:
+  """Returns the options of the pictures that a policy sees."""
+  pixels = list(getattr(getattr(found, "about", None), "pixels", ()))
+  return {"observations": ["sensors", "pixels"], "pixels": pixels} if pixels else {}
 
 
 def _write_json(path: pathlib.Path, results: list[Result]):

@@ -161,6 +161,65 @@ def test_a_policy_that_is_no_regular_file_is_refused(tmp_path):
       policy.load(path)
 
 
+def seeing(pixels=(12, 16), head=None):
+  """Returns a policy of one feature, which is where a picture is bright, and says where."""
+  about = dataclasses.replace(made().about, pixels=pixels, observations=("held",))
+  weight = np.zeros((1, 3, 1, 1))
+  weight[0, :, 0, 0] = 40.0
+  encoder = [(weight, np.zeros(1)), (np.eye(3) if head is None else head, np.zeros(3))]
+  layers = [(np.eye(4, 4, 1), np.zeros(4))]  # the first input is what `held` is
+  return made(about=about, mean=np.zeros(1), scale=np.ones(1), layers=layers, encoder=encoder)
+
+
+def test_a_policy_says_where_in_a_picture_something_is(tmp_path):
+  path = tmp_path / "policy.safetensors"
+  policy.save(path, seeing())
+  act = policy.load(path).begin()
+  for row, column in ((0, 0), (4, 10), (10, 14)):
+    pixels = np.zeros((12, 16, 3), np.uint8)
+    pixels[row, column] = 255
+    said = act({"held": np.zeros(1), "pixels": pixels})
+    # Every second pixel is looked at: 6 rows and 8 columns, from -1 to 1.
+    np.testing.assert_allclose(said[:2], np.tanh([column / 7 - 1, row / 5 - 1]), atol=1e-3)
+  both = policy.load(path).begin(2)({"held": np.zeros((2, 1)), "pixels": np.stack([pixels] * 2)})
+  np.testing.assert_allclose(both, [said, said])
+
+
+def test_an_encoder_is_that_of_torch():
+  torch = pytest.importorskip("torch")
+  pytest.importorskip("rsl_rl")
+  from palpate.tasks.learn.sight import Encoder
+
+  torch.manual_seed(0)
+  encoder, random = Encoder((20, 28)), np.random.RandomState(0)
+  pixels = random.randint(0, 256, (3, 20, 28, 3)).astype(np.uint8)
+  expected = encoder(torch.from_numpy(pixels).flatten(1)).detach().numpy()
+  layers = [(each.weight.detach().numpy(), each.bias.detach().numpy()) for each in encoder.layers]
+  np.testing.assert_allclose(policy.encode(pixels, layers), expected, atol=1e-5)
+  assert expected.std(axis=0).max() > 0.01
+
+
+def test_a_policy_of_pictures_is_refused_where_they_are_otherwise(tmp_path):
+  path = tmp_path / "policy.safetensors"
+  for found, said in (
+    (seeing(head=np.eye(3, 4)), r"encoder_weight1 has shape \(3, 4\), expected \(3, 3\)"),
+    (seeing(pixels=(0, 8)), r"pixels is \[0, 8\], expected height and width"),
+    (seeing(pixels=()), r"pixels is \[\], but 2 layers see them"),
+    (dataclasses.replace(seeing(), encoder=()), r"pixels is \[12, 16\], but 0 layers"),
+  ):
+    policy.save(path, found)
+    with pytest.raises(ValueError, match=said):
+      policy.load(path)
+  for options, said in (
+    ({}, "the policy observes pixels, which observations lack"),
+    ({"pixels": (16, 16)}, "the policy sees 12 x 16 pixels, the exercise draws 16 x 16"),
+  ):
+    options = {"observations": ["sensors", "held", *(["pixels"] if options else [])], **options}
+    env = suite.load("touch", "easy", task_kwargs={"random": 0, **options})
+    with pytest.raises(ValueError, match=said):
+      seeing().check(env)
+
+
 SHIPPED = sorted(policy.FOLDER.glob(f"*{policy.SUFFIX}"))
 PLAYED = ("grasp_easy", "touch_easy")  # always: others take minutes
 
