@@ -26,7 +26,7 @@ from .sight import PICTURES
 
 TEACHER = "teacher"  # group of observations
 STEPS = 64  # control steps of an iteration
-UPDATES, WORLDS = 32, 64  # steps of the optimiser of an iteration, and worlds of each
+UPDATES, WORLDS = 32, 32  # steps of the optimiser of an iteration, and worlds of each
 _KEPT = 4  # iterations that are learned from
 _ALONE = 1 / 3  # share of worlds where the student acts alone, once it acts
 _TURN = 40  # control steps of a turn elsewhere, in the mean
