@@ -65,6 +65,11 @@ class About:
   licence: str = "Apache-2.0"
   pixels: Sequence[int] = ()
 
+  @property
+  def sees(self) -> bool:
+    """Whether it sees a picture."""
+    return bool(self.pixels)
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Policy:
@@ -101,7 +106,7 @@ class Policy:
       raise ValueError(f"the policy's action is {', '.join(about.components)}, expected "
                        f"{', '.join(task.components)}")  # fmt: skip
     spec = env.observation_spec()
-    seen = [PIXELS] if about.pixels else []
+    seen = [PIXELS] if about.sees else []
     missing = [name for name in (*about.observations, *seen) if name not in spec]
     if missing:
       raise ValueError(f"the policy observes {', '.join(missing)}, which observations lack")

@@ -12,7 +12,7 @@ pytest.importorskip("safetensors")
 
 from palpate.tasks import registry, suite
 from palpate.tasks.core import performer
-from palpate.tasks.learn import policy
+from palpate.tasks.learn import demonstrations, policy
 from safetensors.numpy import save_file
 
 NAMES = ("target", "held")
@@ -229,9 +229,13 @@ def test_policies_that_come_along_are_small_and_of_their_exercise():
   for path in SHIPPED:
     about = policy.load(path).about
     domain, task = about.task.split("/")
-    assert path.stem == f"{domain}_{task}" and task in registry.TASKS[domain]
-    assert path.stat().st_size < 150_000
-    assert about.training["lessons"] or about.training["from"]  # of another level
+    assert path.stem == f"{domain}_{task}" + about.sees * "_pixels"
+    assert task in registry.TASKS[domain]
+    assert path.stat().st_size < (1_000_000 if about.sees else 150_000)
+    if about.sees:  # what a robot has, and the picture
+      assert {demonstrations.group(name) for name in about.observations} == {"sensors"}
+    else:
+      assert about.training["lessons"] or about.training["from"]  # of another level
 
 
 @pytest.mark.parametrize(
@@ -242,8 +246,10 @@ def test_policies_that_come_along_are_small_and_of_their_exercise():
   ],
 )
 def test_policies_that_come_along_solve_their_exercise(path):
-  task = policy.load(path).about.task
-  env = suite.load(*task.split("/"), task_kwargs={"random": 7, "surroundings": "none"})
+  about = policy.load(path).about
+  seen = {"observations": ("sensors", "pixels"), "pixels": tuple(about.pixels)}
+  options = seen if about.sees else {"surroundings": "none"}
+  env = suite.load(*about.task.split("/"), task_kwargs={"random": 7, **options})
   outcomes, act = [], performer.make(env, "trained")
   while "success" not in outcomes and len(outcomes) < 3:
     timestep = env.reset()
@@ -256,3 +262,5 @@ def test_policies_that_come_along_solve_their_exercise(path):
 def test_an_exercise_without_a_policy_says_which_have_one():
   with pytest.raises(ValueError, match=r"no trained policy comes with sew/easy, .* touch/easy"):
     policy.shipped("sew/easy")
+  with pytest.raises(ValueError, match=r"policy of pictures comes with sew/easy, .* retract/easy"):
+    policy.shipped("sew/easy", pictures=True)
