@@ -11,8 +11,8 @@ its best progress (`score`). What it found is tried on episodes that it has not 
 A success is honest when the work was done, judged apart from the exercise's own rules: contact as
 long and as often as the exercise has targets, jaws that were wide open before they held, a curve
 that was pressed on or cut nearly everywhere, a strip that was touched for two seconds, a field that
-was felt before the report. What scores above the expert in the same episode is counted, with the
-categories of the score that it is better in. Needs `cma`.
+was felt before the report, a hook that touched for half a second. What scores above the expert in
+the same episode is counted, with the categories of the score that it is better in. Needs `cma`.
 """
 
 from __future__ import annotations
@@ -38,11 +38,12 @@ NAMES = ("touch/easy", "probe/easy", "probe/palpate_easy", "grasp/easy", "trace/
 NAMES += ("retract/easy", "cut/easy", "dissect/easy", "tease/easy", "bimanual/easy")
 KINDS = ("aimed", "blind", "styled")
 PHASES = 3
-LENGTH = 6.0  # of an episode of `blind` and `aimed` policies [s]
+LENGTH = 6.0  # of an episode of `blind` and `aimed` policies, for each hand [s]
 _REACH = 0.025  # of the offsets of aimed policies [m]
 _SPEED = 0.06  # of their tip [m/s]
 _LEAP = 10  # points of a curve that follow one another in two control steps, at most
 _CONTACT, _STROKES = 0.02, 2.0  # force of a contact [N], time of that to free a strip [s]
+_GRAZE, _HOOKED = 0.005, 0.5  # the same of a hook
 _SEEN, _FRESH = 1000, tuple(range(2000, 2004))  # seeds
 # What `styled` policies may be, from -1 to 1; the expert is inside.
 MANNERS = {
@@ -115,10 +116,10 @@ class Attack:
 
   def __init__(self, name: str, kind: str, length: float = LENGTH):
     """Loads the exercise; `kind` is one of `KINDS`, `length` that of an episode [s]."""
-    options = {} if kind == "styled" else {"time_limit": length}
+    hands = 1 + (suite.split(name) in suite.BIMANUAL)
+    options = {} if kind == "styled" else {"time_limit": hands * length}
     self.env = tasks.load(*suite.split(name), {"random": 0, **options})
-    self.name, self.kind, self.steps = name, kind, round(length / CONTROL_TIMESTEP)
-    hands = 2 if self.env.task.other else 1
+    self.name, self.kind, self.steps = name, kind, round(hands * length / CONTROL_TIMESTEP)
     extra = len(self.env.task.components) - hands * len(base.AXES)
     self.width = extra + hands * (len(base.AXES) if kind == "blind" else 3)
     self.size = len(MANNERS) if kind == "styled" else PHASES * self.width
@@ -180,7 +181,7 @@ class Work:
   """What was done in an episode, from forces and joints alone."""
 
   def __init__(self):
-    self.opened, self.pressed, self.touches, self._touching = 0.0, 0, 0, False
+    self.opened, self.pressed, self.hooked, self.touches, self._touching = 0.0, 0, 0, 0, False
     self.places: set[int] = set()  # points of a curve that the tip went by as it pressed
     self._last = -1  # of these, -1 where it did not press
 
@@ -192,6 +193,8 @@ class Work:
     self.touches += touching and not self._touching
     self._touching = touching
     self.pressed += touching
+    if physics.second:
+      self.hooked += float(np.linalg.norm(physics.second.tissue_force())) > _GRAZE
     near = -1
     if touching and hasattr(task, "curve"):
       off = getattr(task, "now", task.curve) - physics.tip_pos()
@@ -203,7 +206,8 @@ class Work:
   def done(self, task) -> bool:
     """Whether it was the work that the exercise asks for."""
     if task.jaws:
-      return self.opened > 0.3
+      alone = not task.second or self.hooked * task.control_timestep > _HOOKED
+      return self.opened > 0.3 and alone
     if hasattr(task, "curve"):
       return len(self.places) > 0.8 * len(task.curve)
     if hasattr(task, "freed"):
