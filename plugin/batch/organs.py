@@ -61,6 +61,7 @@ def plan_of(body, config, volumes: bool = False) -> devices.Plan | None:
     bends=body.has_bending,
     springs=config.elements == "spring",
     volumes=bool(volumes or config.bulk or config.pressure),
+    tensions=config.tension > 0,
     meshes=config.spare > 0,
   )
 

@@ -74,6 +74,14 @@ class Config:
   thickness: float = _row(
     0.002, reading.POSITIVE, "thickness of membrane and plate, also on a solid", "m", TISSUE
   )
+  tension: float = _row(
+    0.0,
+    reading.NOT_NEGATIVE,
+    "of the membrane in the rest shape, force by length in all directions: a wall pinned at "
+    "its rim gapes where it is cut ([cutting](cutting.md#sheets-under-tension))",
+    "N/m",
+    NUMBER,
+  )
   capsule_young: tuple[float, ...] = _row(
     (),
     (reading.numbers, "a number > 0"),
@@ -399,6 +407,10 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
   for key in ("follow", "mass", "pin", "resident", "support"):
     if key in given and not config.window:
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only with window")
+  if config.tension and config.elements != "membrane":
+    raise ValueError(
+      f"organ {organ!r}: tension is {config.tension:g}, allowed only with elements='membrane'"
+    )
   if config.elements == "solid":
     _check_solid(organ, config, given)
   for key in () if config.elements == "solid" else ("tetrahedra", "capsule_young"):
@@ -456,8 +468,9 @@ def _check_ties(organ: str, config: Config):
       raise ValueError(
         f"organ {organ!r}: integrator is {config.integrator!r}, allowed only without {key}"
       )
-  if config.relax_share and config.pressure:
-    raise ValueError(f"organ {organ!r}: relax_share is set, allowed only where pressure is 0")
+  for key in ("pressure", "tension"):
+    if config.relax_share and getattr(config, key):
+      raise ValueError(f"organ {organ!r}: relax_share is set, allowed only where {key} is 0")
   if config.carrier == OWN and config.pin:
     raise ValueError(f"organ {organ!r}: carrier is 'own', allowed only without pin")
 

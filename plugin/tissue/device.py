@@ -142,6 +142,7 @@ class Plan:
     bends: whether there is bending
     springs: whether elements are springs
     volumes: whether there may be volume stiffness or pressure
+    tensions: whether the rest shape is under tension
     meshes: whether worlds have meshes of their own
   """
 
@@ -153,6 +154,7 @@ class Plan:
   bends: bool
   springs: bool
   volumes: bool
+  tensions: bool = False
   meshes: bool = False
 
 

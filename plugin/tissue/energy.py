@@ -37,7 +37,8 @@ _find = kernel("find_densities", "tissue/neohookean.h", Densities, CONSTANTS)
 def membrane(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   """Returns the St. Venant-Kirchhoff plane stress energy [J].
 
-  Sum over triangles of A t (lambda'/2 (tr E)^2 + mu E : E), E the Green strain.
+  Sum over triangles of A t (lambda'/2 (tr E)^2 + mu E : E), E the Green strain; under a tension T
+  of the rest shape A T (tr E + T / (2 t (lambda' + mu))) more, which makes it 0 in slack tissue.
 
   Args:
     mesh: the surface at rest
@@ -63,8 +64,9 @@ def membrane(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   trace = (g22 * e11 - 2 * g12 * e12 + g11 * e22) / det
   square = trace**2 - 2 * (e11 * e22 - e12 * e12) / det
   lam, mu = configuration.lame(config, mesh.nelem)
-  volume = 0.5 * np.sqrt(det) * config.thickness
-  return float((volume * (0.5 * lam * trace**2 + mu * square)).sum())
+  area, taut = 0.5 * np.sqrt(det), 0.5 * config.tension / (config.thickness * (lam + mu))
+  stretched = area * config.thickness * (0.5 * lam * trace**2 + mu * square)
+  return float((stretched + config.tension * area * (trace + taut)).sum())
 
 
 def springs(mesh: Mesh, config: Config, u: np.ndarray) -> float:

@@ -151,7 +151,7 @@ def _world_step(plan: Plan) -> Kernel:
 @functools.cache
 def _world_kernel(plan: Plan) -> Kernel:
   kinds = {"BENDING": plan.bends, "SPRINGS": plan.springs, "VOLUMES": plan.volumes}
-  kinds["MESHES"] = plan.meshes
+  kinds |= {"TENSIONS": plan.tensions, "MESHES": plan.meshes}
   constants = _CONSTANTS | {"OWN": plan.own} | {name: int(kind) for name, kind in kinds.items()}
   tag = f".{plan.own}.{plan.threads}.{plan.per_sm}." + "".join(str(int(k)) for k in kinds.values())
   bounds = (plan.threads, plan.per_sm)

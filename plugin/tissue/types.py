@@ -93,7 +93,7 @@ class Stage(enum.IntEnum):
 # what of h a step takes off the damping, see `shape.eased`.
 NUMBERS = (
   "foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness",
-  "shear", "lame", "plate", "eased",
+  "shear", "lame", "plate", "eased", "tension",
 )  # fmt: skip
 
 # What native code knows of these, as constexpr.
@@ -106,7 +106,7 @@ CONSTANTS: dict[str, int | float] = {
   **{stage.name: stage.value for stage in Stage},
   "NUMBERS": len(NUMBERS),
   # Whether code for these is compiled; which of them there are is found as it runs.
-  **dict.fromkeys(("BENDING", "SPRINGS", "VOLUMES", "MESHES"), 1),
+  **dict.fromkeys(("BENDING", "SPRINGS", "VOLUMES", "TENSIONS", "MESHES"), 1),
   **{name.upper(): k for k, name in enumerate(NUMBERS)},
 }
 

@@ -101,8 +101,8 @@ def batch_alone(device):
 
 
 @pytest.mark.parametrize(
-  ("windows", "keys"), [(True, {"bend": 0.0}), (False, {"bend": 1.0, "bulk": 1e4})],
-  ids=["membrane", "nodal shell"],
+  ("windows", "keys"), [(True, {"bend": 0.0, "tension": 2.0}), (False, {"bend": 1.0, "bulk": 1e4})],
+  ids=["membrane under tension", "nodal shell"],
 )  # fmt: skip
 def test_a_cut_world_goes_on_as_the_plugin_does(device, windows, keys):
   batch = palpate.batch.make(pressed(windows, **keys), 2, device=device, nodes=40)

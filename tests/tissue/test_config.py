@@ -30,6 +30,7 @@ REFUSED = [
   ("bend", "-1", "a number >= 0"),
   ("foundation", "-1", "a number >= 0"),
   ("bulk", "nan", "a number >= 0"),
+  ("tension", "-1", "a number >= 0"),
   ("pressure", "inf", "a finite number"),
   ("damping", "-0.002", "a number >= 0"),
   ("integrator", "euler", "'implicit'"),
@@ -91,6 +92,13 @@ def test_an_unknown_key_is_refused_with_the_list_of_keys():
     ({"elements": "spring"}, True, ("elements is 'spring'", "stiffness is missing")),
     ({"bulk": "1000"}, False, ("bulk is 1000", "closed surface")),
     ({"pressure": "-5"}, False, ("pressure is -5", "closed surface")),
+    (
+      {"elements": "spring", "stiffness": "200", "tension": "3"},
+      True,
+      ("tension is 3", "elements='membrane'"),
+    ),
+    ({"elements": "solid", "tension": "3"}, True, ("tension is 3", "elements='membrane'")),
+    ({"relax_share": "0.5", "tension": "3"}, True, ("relax_share is set", "tension is 0")),
   ],
 )
 def test_a_wrong_combination_is_refused(texts, closed, words):

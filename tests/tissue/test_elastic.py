@@ -15,6 +15,7 @@ YOUNG = 5000.0
 # Every term by itself, all of them together, and open surfaces with pins.
 TERMS = {
   "membrane": {"poisson": 0.3},
+  "tension": {"poisson": 0.3, "tension": 5.0},
   "spring": {"elements": "spring", "stiffness": 20.0},
   "bending": {"young": (1e-6,), "bend": 1e10},
   "foundation": {"young": (1e-6,), "foundation": 2e4},
@@ -94,7 +95,7 @@ def test_force_on_an_open_surface(scenes, device, elements):
   np.testing.assert_allclose(found, expected, atol=3e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("name", [name for name in TERMS if name not in ("pressure", "all")])
+@pytest.mark.parametrize("name", sorted(set(TERMS) - {"pressure", "tension", "all"}))
 def test_no_force_at_rest_to_the_bit(scenes, device, name):
   mesh, _, body = _surface(scenes, name, device=device)
   found = scenes.force(body, np.zeros((mesh.nvert, 3)))
@@ -177,7 +178,7 @@ def _tensile(mesh, name):
   return 0.2 * centred + _displacement(mesh, 0.01)
 
 
-@pytest.mark.parametrize("name", ["membrane", "spring", "foundation"])
+@pytest.mark.parametrize("name", ["membrane", "tension", "spring", "foundation"])
 def test_matrix_is_the_derivative_of_the_force_in_tension(scenes, name):
   # With bend = bulk = 0 A - M is (h^2 + h damping) K; at g = 1 and no mass it is K.
   mesh, config, body = _surface(scenes, name)

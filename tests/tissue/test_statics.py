@@ -1,5 +1,6 @@
 """Closed forms of plates and membranes, through mj_step: strips, spheres and plates."""
 
+import mujoco
 import numpy as np
 import pytest
 from palpate.tissue.geometry import mesh as topology
@@ -160,3 +161,41 @@ def test_a_square_plate_sags_under_a_uniform_load(scenes, device, clamped):
   found = -organ.displacement[:, 2].min()
   # Corners of a supported plate would lift; the pinned ones hold them as the theory does.
   assert found == pytest.approx(sag, rel=0.03)
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.45])
+def test_a_free_sheet_under_tension_shrinks_as_much_as_it_was_stretched(scenes, device, nu):
+  young, tension = 1e4, 2.0
+  points, elem = scenes.triangular(0.06, 0.052, 6, 6)
+  middle = int(np.argmin(np.abs(points - [0.03, 0, 0]).sum(axis=1)))
+  config = STATIC | {"young": young, "poisson": nu, "bend": 0, "tension": tension, "device": device}
+  xml = scenes.world(scenes.organ(points, elem, mass=1e-3, pin=[middle], **config), h=LONG)
+  model, data, organ = scenes.load(xml)
+  slack = np.sqrt(1 - 2 * tension * (1 - nu) / (young * THICKNESS))  # E = -T (1 - nu) / (E t)
+  stretched = THICKNESS * young / (1 - nu) * ((1 - slack**2) / 2) ** 2 * 0.06 * 0.052
+  assert organ.energy == pytest.approx(stretched, rel=1e-5)
+  mujoco.mj_step(model, data, 30)  # it may turn around the vertex that is pinned
+  far = np.linalg.norm(points - points[middle], axis=1)
+  found = np.linalg.norm(organ.xpos - points[middle], axis=1)
+  np.testing.assert_allclose(found, slack * far, atol=2e-7)
+  assert organ.energy < 1e-6 * stretched
+
+
+def test_a_held_membrane_under_tension_sags_on_a_foundation(scenes, device):
+  # T laplace(w) - k w + p = 0 with p = P sin(pi x / a) sin(pi y / a): w = p / (k + 2 T pi^2 / a^2).
+  side, tension, bed, pressure = 0.1, 3.0, 4e3, 1.0
+  points, elem = scenes.triangular(side, side, 24, 28)
+  x, y = points[:, 0], points[:, 1] + side / 2
+  pin = np.flatnonzero((np.minimum(x, side - x) < 1e-9) | (np.minimum(y, side - y) < 1e-9))
+  config = STATIC | {"young": 1.0, "bend": 0, "tension": tension, "foundation": bed}
+  xml = scenes.world(
+    scenes.organ(points, elem, mass=1e-4, pin=pin, device=device, **config), h=LONG
+  )
+  model, data, organ = scenes.load(xml)
+  shape = np.sin(np.pi * x / side) * np.sin(np.pi * y / side)
+  force = np.zeros(points.shape)
+  force[:, 2] = -pressure * shape * topology.vertex_areas(points, elem)
+  _load(scenes, organ, data, force)
+  scenes.settle(model, data, organ, still=1e-4)
+  sag = pressure / (bed + 2 * tension * (np.pi / side) ** 2)
+  np.testing.assert_allclose(-organ.displacement[:, 2], sag * shape, atol=0.01 * sag)

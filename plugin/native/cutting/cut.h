@@ -202,7 +202,7 @@ PALPATE void cut_surface(const Fields& f, Thread t, int) {
   if (t.tid) return;
   const auto m = surface_of(f.surface);
   Scratch memory = {f.ints.data, f.reals.data, f.nint, f.nreal, false};
-  const Material p = {f.kind, f.held, f.thickness, f.stiffness, f.given, f.lame.data, f.shear.data,
+  const Material p = {f.kind, f.held, f.thickness, f.tension, f.stiffness, f.given, f.lame.data, f.shear.data,
                       f.whole.data, f.pull.data, f.hard.data, f.disp.data, f.kind != NO_ENERGY};
   Path path = {f.edge, f.path.data, f.spot.data, f.npath, nullptr, 0};
   const bool found = find_runs(m, path, memory);

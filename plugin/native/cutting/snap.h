@@ -11,7 +11,7 @@ enum { NO_ENERGY, MEMBRANE, SPRINGS_OF_EDGES };
 // What tells the energy around vertices: of triangles, and of the springs that hold vertices.
 struct Material {
   int kind, held;
-  double thickness, stiffness, given;  // `given`: what cuts has brought so much around each vertex
+  double thickness, tension, stiffness, given;  // `given`: what cuts has brought so much around each vertex
   const double *lame, *shear;  // of triangles
   const double *whole, *pull, *hard;  // of vertices: energy of springs, force, stiffness
   const double* disp;
@@ -26,7 +26,9 @@ struct Material {
       const double e12 = 0.5 * (dot(r1, p2) + dot(r2, p1) + dot(p1, p2));
       const double trace = (g22 * e11 - 2.0 * g12 * e12 + g11 * e22) / det;
       const double square = trace * trace - 2.0 * (e11 * e22 - e12 * e12) / det;
-      return 0.5 * sqrt(det) * thickness * (0.5 * lame[t] * trace * trace + shear[t] * square);
+      const double area = 0.5 * sqrt(det), taut = 0.5 * tension / (thickness * (lame[t] + shear[t]));
+      return area * thickness * (0.5 * lame[t] * trace * trace + shear[t] * square)
+        + area * tension * (trace + taut);
     }
     double sum = 0.0;
     for (int c = 0; c < 3; ++c) {

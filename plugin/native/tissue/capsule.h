@@ -32,7 +32,7 @@ PALPATE void capsule_row(const Fields& f, Thread t, int stage) {
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
     const Fan fan = capsule_fan(f, t.world, s, lane);
     const Motion m = {at.disp, at.vel, ld3(at.disp + 24 * s, lane), ld3(at.vel + 24 * s, lane)};
-    const Sum sum = around(fan, m, want, lane);
+    const Sum sum = around<false>(fan, m, want, lane);
     V3 b = skin.h * sum.force + skin.gv * sum.rate;
     S3 self = splat(skin.g) * sum.stiffness;
     if (skin.bends) self = self + skin.bent(fan, sum, s, b, lane);

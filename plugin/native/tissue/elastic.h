@@ -26,6 +26,13 @@ PALPATE Moduli moduli(Metric g, V mu, V lam) {
           m2 * g11 * g12, m2 * g22 * g12, lam * g12 * g12 + mu * (g11 * g22 + g12 * g12)};
 }
 
+// Stress of a tension along the sheet at rest [N/m], times the volume as the others: A T G^ab.
+PALPATE Stress pretension(Metric g, float tension) {
+  const V det = vmax(g.g11 * g.g22 - g.g12 * g.g12, splat(1e-30f));  // (2 A)^-2
+  const V size = splat(0.5f * tension) / vsqrt(det);
+  return {size * g.g11, size * g.g12, size * g.g22};
+}
+
 // Stress of a triangle with rest vectors r, t to its corners and displacements p, q of them.
 PALPATE Stress stress(Moduli c, V3 r, V3 p, V3 t, V3 q) {
   const V e11 = dot(r, p) + 0.5f * dot(p, p);
@@ -147,7 +154,7 @@ struct Sum {
 struct Motion { const float* disp; const float* vel; V3 u, v; };
 
 // What is asked of a fan: g = h^2 + h damping; `normal` has the stiffness that covers bending.
-struct Wanted { float g, spring, shear, lame; bool matrix, areas, bending; const float* normal; };
+struct Wanted { float g, spring, shear, lame, tension; bool matrix, areas, bending; const float* normal; };
 
 // Adds the triangle of entries a and b, at rest ra and rb, to the area vector.
 PALPATE void area(Sum& sum, Metric g, V3 a, V3 b) {
@@ -158,7 +165,8 @@ PALPATE void area(Sum& sum, Metric g, V3 a, V3 b) {
   sum.squeeze = vmax(sum.squeeze, has / vmax(d2, splat(0.01f)));
 }
 
-// Goes once around the fan and writes the blocks of its edges.
+// Goes once around the fan, which is under tension or not, and writes the blocks of its edges.
+template <bool TAUT>
 PALPATE Sum around(const Fan& fan, const Motion& m, const Wanted& want, Lane lane) {
   const V zero = splat(0.0f);
   const V3 none = {zero, zero, zero};
@@ -186,7 +194,11 @@ PALPATE Sum around(const Fan& fan, const Motion& m, const Wanted& want, Lane lan
         lambda = factor * lambda;
       }
       const Moduli c = moduli(g, mu, lambda);
-      const Stress s = stress(c, r, p, t, q);
+      Stress s = stress(c, r, p, t, q);
+      if (TAUT) {
+        const Stress more = pretension(g, want.tension);
+        s = {s.s11 + more.s11, s.s12 + more.s12, s.s22 + more.s22};
+      }
       if (k > 0) sum.force += (s.s11 + s.s12) * a + (s.s12 + s.s22) * b;
       const Stress pulled = tensile(s, g);
       block = block + towards_a(c, pulled, a, b);
@@ -273,7 +285,7 @@ struct Assembly {
   const float* const corner =
     f.system.elem_corner.data + 24 * (size_t)world * f.shape.nelemslice;
   const Wanted want = {
-    g, number[STIFFNESS], number[SHEAR], number[LAME], matrix, areas, bends, normal
+    g, number[STIFFNESS], number[SHEAR], number[LAME], number[TENSION], matrix, areas, bends, normal
   };
 
   // Adds the bending of a fan to the impulse b, and says what the diagonal block has of it.
@@ -293,7 +305,8 @@ struct Assembly {
     const size_t own = (size_t)world * f.shape.nslice + s;
     const Fan fan = fan_of(f, world, at, s, lane);
     const Motion m = {at.disp, at.vel, ld3(at.disp + 24 * s, lane), ld3(at.vel + 24 * s, lane)};
-    Sum sum = around(fan, m, want, lane);
+    Sum sum = TENSIONS && want.tension != 0.0f ? around<true>(fan, m, want, lane)
+                                               : around<false>(fan, m, want, lane);
     const V mass = ld(f.state.mass.data + 8 * own, 0, lane);
     const V kf = splat(foundation) * ld(f.shape.area.data + mesh, s, lane), diag = mass + g * kf;
     V3 b = h * (sum.force + ld3(f.state.force_ext.data + 24 * own, lane) - kf * m.u)

@@ -48,6 +48,7 @@ class Cutting:
   held: int  # whether springs hold vertices
   edge: wp.float64  # mean length of the whole's edges [m]
   thickness: wp.float64  # [m]
+  tension: wp.float64  # [N/m]
   stiffness: wp.float64  # of an edge's spring [N/m]
   given: wp.float64  # by which the energy around a vertex may rise as it moves [J]
   home: longs("nelem")  # `Mesh.home`
@@ -277,7 +278,8 @@ class Knife(Native):
     if how != self._how:
       fields.kind, fields.held, fields.given = self._how = how
     if config and config is not self._config and config != self._config:
-      fields.thickness, fields.stiffness = config.thickness, config.stiffness
+      fields.thickness, fields.tension = config.thickness, config.tension
+      fields.stiffness = config.stiffness
       host["lame"][:], host["shear"][:] = configuration.lame(config, self._whole.nelem)
       self._config = config
     if held is not None:

@@ -118,6 +118,30 @@ def test_a_strip_that_is_cut_across_lets_its_loose_half_go():
 
 
 @BOTH
+def test_a_slit_in_a_sheet_under_tension_opens_as_a_crack_does(windows, device):
+  # A crack of length 2 a in a wide plate of stress s in all directions opens by 4 s a / E in the
+  # middle and gives back pi s^2 a^2 / E by thickness (plane stress; Westergaard 1939); s = T / t.
+  side, half, young, thickness, tension = 0.24, 0.012, 1e5, 0.002, 0.2
+  points, elem = scenes.triangular(2, 2, 56, 64)
+  points[:, 0] -= 1
+  points[:, :2] *= 0.5 * side * (0.25 + 0.75 * points[:, :2] ** 2)  # a quarter of an edge inside
+  pin = np.flatnonzero(np.abs(points).max(axis=1) > 0.499 * side)
+  given = {"young": young, "thickness": thickness, "bend": 0, "tension": tension, "pin": pin}
+  model, data = scene((points, elem), windows, tool=False, mass=1e-3, device=device, **given)
+  organ = handle(model, data)
+  run(model, data, 5)
+  before = organ.energy
+  assert np.abs(organ.displacement).max() < 1e-8
+  report = organ.cut(np.linspace([-half, 0, 0], [half, 0, 0], 40))
+  run(model, data, 200)
+  a, strain = report.length / 2, tension / (thickness * young)
+  across = organ.displacement[np.abs(organ.xpos0[:, 0]) < 0.3 * a, 1]
+  # Stiffer than a wide plate: 4 % by the mesh (2 with half the edges), 3 by the sides that hold.
+  assert 0.92 < np.ptp(across) / (4 * strain * a) < 1
+  assert 0.86 < (before - organ.energy) / (np.pi * strain * tension * a**2) < 1
+
+
+@BOTH
 @pytest.mark.parametrize("kind", ["plate", "membrane", "spring"])
 def test_mass_and_momentum_are_kept_and_energy_does_not_rise(windows, kind):
   keys = {"plate": {}, "membrane": {"bend": 0}, "spring": {"elements": "spring", "stiffness": 40}}
