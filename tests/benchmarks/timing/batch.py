@@ -235,7 +235,7 @@ def draw(out: pathlib.Path) -> pathlib.Path:
     axes.set(xscale="log", yscale="log")
     plots.plain(axes.xaxis)
     plots.plain(axes.yaxis)
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
   return plots.save(figure, out / "batch.png", "Batches on one GPU")
 
 
