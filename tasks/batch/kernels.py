@@ -222,8 +222,8 @@ def reach(s: Common, w: int, distance: float):
 
 
 @wp.func
-def judge(s: Common, w: int, progress: float, outcome: int):
-  """Ends a control step that came to a progress and an outcome; a success is all of it."""
+def judge(s: Common, w: int, progress: float, shaping: float, outcome: int):
+  """Ends a control step that came to these, see `Rules`; a success is all of the progress."""
   over, lies, pushes, harmed = parts(
     s.tissue_peak[w], s.shaft_peak[w], s.around_peak[w], s.force_limit, s.damage
   )
@@ -244,7 +244,7 @@ def judge(s: Common, w: int, progress: float, outcome: int):
   if harmed > 0.0:
     found = DAMAGED
     now = -1.0
-  paid = _SHARE * now
+  paid = _SHARE * (now + shaping)
   if found == SUCCESS or found == DAMAGED:
     paid = now
   price = wp.min(_PRICE * total, _MOST - s.harm[w])

@@ -215,6 +215,12 @@ def holds(s: Common):
 
 
 @word
+def opening(s: Common):
+  """See `rules`."""
+  return s.gripper[s.world, 0]
+
+
+@word
 def grip(s: Common, o: Any, value: float):
   """See `rules`."""
   reach(s, o, value)
@@ -280,14 +286,14 @@ def compiled(own: Rules) -> tuple[Any, Any, Any, Any]:
     for name, kind in own.fields.items()
   }
   state: Any = wp.struct(type("State", (), {"__annotations__": kinds, "__module__": module.name}))
-  rule = translate(own.advance, module, known)
+  rule, shaping = (translate(found, module, known) for found in (own.advance, own.shaping))
   judge = kernels.judge
 
   def advance(s: Common, states: wp.array(dtype=state)):
     s.world = wp.tid()
     o, progress, outcome = rule(s, states[s.world])
     states[s.world] = o
-    judge(s, s.world, progress, outcome)
+    judge(s, s.world, progress, shaping(s, o), outcome)
 
   def following(name: str, rule: Any) -> Any:
     """Returns the kernel of a rule that returns the state alone."""

@@ -19,13 +19,15 @@ four, see `handle`; a spring and a damper pull the tip there, and the hand feels
 
 Observations are in groups to choose from, see `observation` and docs/environments.md.
 
-Reward: a task measures its progress in [-1, 1], 0 at the start, 1 on success, -1 on damage; while
-it runs, 0.4 of it is its potential phi, in the end all of it. `dense` (the default) pays the change
-of that, phi now - phi a step ago, so that what is lost costs what it had paid; this is the shaping
-of Ng, Harada and Russell 1999. It takes a tenth of the step's cost (`task.cost`, see `safety`:
-force over the limit, shaft against the organ, damage), until the costs of the episode have taken
-0.55. The rewards of a success add up to 0.45 to 1, those of any other episode to less than 0.4.
-`sparse` pays 1 on the step of success and 0 elsewhere.
+Reward: a task measures its progress in [-1, 1], 0 at the start, 1 on success, -1 on damage. Some
+have a shaping too, which tells the way where the progress does not, such as to open the jaws; its
+sum with the progress stays below 1. While a task runs, 0.4 of that sum is its potential phi; in the
+end phi is all of the progress. `dense` (the default) pays the change of phi in a step, so that what
+is lost costs what it had paid: as part of a potential the shaping leaves the best policy what it is
+(Ng, Harada and Russell 1999). It takes a tenth of the step's cost (`task.cost`, see `safety`: force
+over the limit, shaft against the organ, damage), until the costs of the episode have taken 0.55.
+The rewards of a success add up to 0.45 to 1, those of any other episode to less than 0.4. `sparse`
+pays 1 on the step of success and 0 elsewhere.
 The domains' formulas of progress use `rules.closeness`: 1 at the goal, 0 at the distance that the
 exercise began with, towards -1 far away.
 
@@ -78,6 +80,7 @@ class Task(engine.Task):
     drawn: what `randomisation` drew for this episode
     outcome: how the episode ended, see the module's head; None while it runs
     progress: see the module's head [-]
+    shaping: see the module's head [-]
     best: best progress so far [-]
     cost: of the last control step, see `safety`
     harm: what costs have taken from the dense reward so far, 0.55 at most [-]
@@ -310,7 +313,7 @@ class Task(engine.Task):
         self.random.uniform(-limit, limit, 3), 8.7 * self.random.uniform(-limit, limit, 3)
       )
     self.outcome, self.events = None, []
-    self.progress, self.best, self._phi, self._gain = 0.0, 0.0, 0.0, 0.0
+    self.progress, self.shaping, self.best, self._phi, self._gain = 0.0, 0.0, 0.0, 0.0, 0.0
     self.peak, self._area = 0.0, 0.0
     self.cost, self.harm, self._price = safety.Cost(), 0.0, 0.0
     physics.quiet()
@@ -385,7 +388,10 @@ class Task(engine.Task):
       self.event(physics, "note", label=f"damage{by}: {force:.2f} N")
     elif self.outcome == "success":
       self.event(physics, "note", label="success")
-    phi = self.progress if self.outcome in ("success", "damage") else SHARE * self.progress
+    self.shaping = self.rules.shaping(physics, self) if self.rules else 0.0
+    phi = self.progress
+    if self.outcome not in ("success", "damage"):
+      phi = SHARE * (phi + self.shaping)
     self._gain, self._phi = phi - self._phi, phi
     self.best = max(self.best, self.progress)
     self._price = min(PRICE * self.cost.total, MOST - self.harm)

@@ -29,6 +29,11 @@ TOLD = (float, wp.vec3, wp.mat33)  # kinds of what is observed
 KINDS = (*TOLD, int, bool)
 
 
+def unshaped(s, o):
+  """Returns 0, the shaping of rules whose progress shows the way by itself."""
+  return 0.0
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rules:
   """The rules of a domain.
@@ -46,6 +51,8 @@ class Rules:
     shared: arrays of the state that are the same in all worlds and episodes
     mark: rule (s, o, k) that returns where the pictures' mark k is [m], and its look, one of
       HIDDEN, LATER, NOW; None for no marks
+    shaping: rule (s, o) that returns what the potential of the dense reward has beside the
+      progress; their sum stays below 1 while an episode runs
   """
 
   state: type
@@ -56,11 +63,13 @@ class Rules:
   act: Callable | None = None
   shared: tuple[str, ...] = ()
   mark: Callable | None = None
+  shaping: Callable = unshaped
 
   def __post_init__(self):
     where = f"{self.state.__module__}.{self.state.__qualname__}"
     for name, rule in vars(self).items():
-      given = {"advance": "s and o", "observe": "s and o", "act": "s and o", "mark": "s, o and k"}
+      given = {"mark": "s, o and k"}
+      given |= dict.fromkeys(("advance", "observe", "act", "shaping"), "s and o")
       if name not in given or (rule is None and name in ("act", "mark")):
         continue
       count = 2 + (name == "mark")
@@ -186,6 +195,11 @@ def closing(s: Any) -> bool:
 def holds(s: Any) -> bool:
   """Returns whether tissue is between the jaws, see `Instrument`."""
   return s.holds()
+
+
+def opening(s: Any) -> float:
+  """Returns the opening of the jaws [rad]."""
+  return float(s.gripper()[0])
 
 
 def visible(s: Any, o: Any) -> float:

@@ -18,6 +18,10 @@ quarter of the lift below the site's place and 0.4 of the lift above it. Success
 let go with the site between there and half of the lift. Slipping from the jaws and letting go
 before it is lowered start the holding again. Failure: a force above the damage limit, jaws
 included, or the time limit.
+
+Shaping: until it is grasped 0.36 * `ready`, for jaws that are open near the site, are over the fold
+and close on it; then 0.3 * (1 - min(height / lift, 1)), and less where the fold is pushed down; 0
+once held long enough.
 """
 
 import dataclasses
@@ -33,6 +37,7 @@ from ..core.rules import (
   SUCCESS,
   Rules,
   Vector,
+  clamp,
   closeness,
   closing,
   dot,
@@ -42,6 +47,7 @@ from ..core.rules import (
   holds,
   length,
   miss,
+  opening,
   peak,
   point,
   root,
@@ -103,6 +109,17 @@ class Held:
 
 
 # The rules of holding.
+
+
+def ready(s, o):
+  """Returns how far the jaws are from the way there to closed on the site, 0 to 1 [-].
+
+  They are to be open as they come near, to go over the fold, and to close on it. Closed jaws push
+  the fold ahead of them: no site gets behind their tips, so only open ones have it within.
+  """
+  off, wide = from_tip(s, point(s, o.site)), clamp(opening(s), 0.0, 1.0)
+  within = clamp(off[2] / OVER, 0.0, 1.0) * clamp(2.0 - aside(s, o) / ASIDE, 0.0, 1.0)
+  return 0.4 * max(near(s, o), 0.0) * max(wide, within) + 0.6 * within * (1.0 - 0.6 * wide)
 
 
 def distance(s, o):
@@ -255,6 +272,16 @@ def advance(s, o):
   return o, progress, RUNNING
 
 
+def shaping(s, o):
+  """Returns what tells the way to a grasp, and up from where the fold was pushed down."""
+  if o.done:
+    return 0.0
+  if o.grasped == 0.0:
+    return 0.36 * ready(s, o)
+  share = raised(s, o) / o.lift
+  return 0.3 * (1.0 - clamp(share, 0.0, 1.0)) + 0.1 * clamp(share, -0.4, 0.0)
+
+
 def observe(s, o):
   """Finds target, height and held; grasped is up to date."""
   o.target = point(s, o.site) - tip(s)
@@ -271,7 +298,9 @@ def mark(s, o, k):
 class Grasp(Hold):
   """Grasp, lift, hold, lower, release."""
 
-  rules = Rules(State, advance, observe, ("target", "height", "held", "grasped"), mark=mark)
+  rules = Rules(
+    State, advance, observe, ("target", "height", "held", "grasped"), shaping=shaping, mark=mark
+  )
 
   def __init__(self, scene: Scene, random=None, *, lift: float, hold: float, **kwargs):
     """Makes the task.

@@ -11,6 +11,8 @@ of the disc, at most 1: it tells the way before the first of the disc is seen. O
 instruments are not looked at. Success: the wanted share is seen for the holding time, the site
 being grasped and the force under its limit; what is above it does not count. Failure: a force above
 the damage limit, jaws included, or the time limit.
+
+Shaping: until it is grasped 0.36 * `ready`, as in `grasp`; then 0.3 * (1 - visible / wanted).
 """
 
 import dataclasses
@@ -40,7 +42,7 @@ from ..core.rules import (
 )
 from ..core.scenes import Scene
 from ..registry import exercise
-from .grasp import FUNDUS, Held, Hold, follow, near
+from .grasp import FUNDUS, Held, Hold, follow, near, ready
 from .touch import SLACK
 
 _BEHIND = 0.02  # from the organ's middle to the disc [m]
@@ -113,6 +115,13 @@ def advance(s, o):
   return o, progress, RUNNING
 
 
+def shaping(s, o):
+  """Returns what tells the way to a grasp."""
+  if o.grasped == 0.0:
+    return 0.36 * ready(s, o)
+  return 0.3 * (1.0 - min(o.visible / o.wanted, 1.0))
+
+
 def observe(s, o):
   """Finds target, hidden and held; visible and grasped are up to date."""
   o.target = point(s, o.site) - tip(s)
@@ -132,8 +141,9 @@ class Retract(Hold):
   """Pull tissue aside and hold it."""
 
   rules = Rules(
-    State, advance, observe, ("target", "hidden", "visible", "held", "grasped"), mark=mark
-  )
+    State, advance, observe, ("target", "hidden", "visible", "held", "grasped"),
+    shaping=shaping, mark=mark,
+  )  # fmt: skip
 
   def __init__(
     self,

@@ -9,6 +9,8 @@ the curve while it presses with 0.02 N or more within the tolerance of it, step 
 contact is lost or the curve left, it goes on from what is traced already: what is skipped in the
 air does not count, but for gaps of 3 mm at most, together a tenth of the length. Success: all of
 it, to the last 1.5 mm. Failure: a force above the damage limit, or the time limit.
+
+Shaping: 0.15 * that closeness + 0.1 while it traces, times the share of the length that is left.
 """
 
 import dataclasses
@@ -240,6 +242,13 @@ def advance(s, o):
   return o, 0.1 * closeness(distance(s, o), o.distance0) + 0.9 * traced / whole, RUNNING
 
 
+def shaping(s, o):
+  """Returns what tells the way to the curve, and to stay on it."""
+  left = 1.0 - o.traced / o.arc[o.count - 1]
+  on = 0.1 if o.tracing else 0.0
+  return left * (0.15 * closeness(distance(s, o), o.distance0) + on)
+
+
 def observe(s, o):
   """Finds target and ahead."""
   at, last, here = done(o), o.count - 1, tip(s)
@@ -269,7 +278,7 @@ class Trace(Task):
   """Follow a curve in light contact."""
 
   watch = ("miss", "unintended_contact", "drop")
-  rules = Rules(State, advance, observe, ("target", "ahead"), mark=mark)
+  rules = Rules(State, advance, observe, ("target", "ahead"), shaping=shaping, mark=mark)
 
   def __init__(
     self,

@@ -142,6 +142,35 @@ def test_dense_reward_is_the_change_of_progress_and_takes_back_what_is_lost():
   assert env.reset().observation["progress"] == 0
 
 
+def test_a_potential_shows_the_way_to_a_grasp():
+  env = load("grasp/easy")
+  potential = {}
+
+  def go(opening, *steps):
+    """Notes the potential after moves to heights over the site [m], and openings of the jaws."""
+    act = performer.make(env)
+    timestep = env.reset()
+    act.begin()
+    act.extra[:] = opening
+    up = act.trocar.mat[:, 2]
+    site = env.physics.point(env.task.site)
+    for name, height, opening in steps:
+      for action in act.move(site + height * up, speed=0.03):
+        env.step(action)
+      while act.extra[0] > opening:
+        act.extra -= 0.03
+        timestep = env.step(act.step())
+      potential[name] = env.task.progress + env.task.shaping
+      assert not timestep.last() and potential[name] < 1
+
+  go(-0.68, ("beside, closed", 0.01, -0.68), ("pressed, closed", -0.006, -0.68))
+  go(1.0, ("beside", 0.01, 1.0), ("over it", -0.006, 1.0), ("closing", -0.006, -0.2),
+     ("grasped", -0.006, -0.55), ("lifted", 0.001, -0.55))  # fmt: skip
+  order = ["beside, closed", "beside", "over it", "closing", "grasped", "lifted"]
+  assert sorted(order, key=potential.__getitem__) == order
+  assert potential["pressed, closed"] < potential["over it"] - 0.1
+
+
 def test_quick_forms_agree_with_the_plain_ones():
   env = load("grasp/easy")
   physics = env.physics

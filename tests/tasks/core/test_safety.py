@@ -91,10 +91,10 @@ def test_a_graspers_shaft_costs_by_its_force():
   for cost, force in zip(costs, forces, strict=True):
     assert (cost.force, cost.damage) == (0, 0)
     assert cost.shaft >= (force / safety.SHAFT_LIMIT if force > safety.SHAFT_CONTACT else 0)
-  # What an episode pays until it succeeds is 0.4 of its progress less a tenth of its costs.
+  # What an episode pays until it succeeds is 0.4 of its potential less a tenth of its costs.
   price = min(0.1 * sum(cost.total for cost in costs), 0.55)
   assert env.task.harm == pytest.approx(price) and price > 0
-  assert sum(rewards) == pytest.approx(0.4 * env.task.progress - price)
+  assert sum(rewards) == pytest.approx(0.4 * (env.task.progress + env.task.shaping) - price)
 
 
 def ram(env, speed, deeper=0.003, back=None):
