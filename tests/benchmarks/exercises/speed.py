@@ -2,6 +2,9 @@
 
 With `--against PYTHON`, the Python of another installation of this package, it races that one:
 stretches of 10 control steps in turn, an episode of the same seeds each.
+
+With `--device cuda:0` it times exercises in many worlds, with runs that repeat to the bit and
+without, in turn, and counts the worlds that differ between two runs.
 """
 
 from __future__ import annotations
@@ -14,21 +17,30 @@ import sys
 import time
 
 import mujoco
+import numpy as np
 import palpate
+import warp as wp
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate import tasks
 from palpate.tasks import suite
+from palpate.tasks.batch.vector import Exercises
 from palpate.tasks.core import episode, performer
 from palpate.tasks.recorder import Recorder
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
+MANY = {  # exercises in many worlds, and how many
+  "touch/easy": 1024, "grasp/easy": 512, "cut/easy": 256, "retract/easy": 256, "bimanual/easy": 256,
+}  # fmt: skip
+STEPS, TURNS = 100, 9  # control steps of a run, and stretches that are timed
 
 
 def arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   add = parser.add_argument
-  add("--tasks", nargs="+", metavar="TASK", choices=NAMES, default=NAMES)
+  add("--tasks", nargs="+", metavar="TASK", choices=NAMES, help="all; some in many worlds")
+  add("--device", default="cpu", help="cpu: one world of the plugin; cuda:0 (%(default)s)")
+  add("--worlds", type=int, help="of each exercise, in place of its own number")
   add("--seconds", type=float, default=4.0, help="of stepping a task (%(default)s)")
   add("--against", metavar="PYTHON", type=pathlib.Path, help="of another installation, to race")
   add("--episodes", type=int, default=1, help="of a race (%(default)s)")
@@ -108,14 +120,17 @@ def race(task: str, other: pathlib.Path, episodes: int) -> Row:
 
 def stages(args: argparse.Namespace) -> list[list[Case]]:
   """Returns a case an exercise."""
-  names = args.tasks[:1] if args.short else args.tasks
-  keys = {key: getattr(args, key) for key in ("seconds", "against", "episodes")}
+  names = args.tasks or (NAMES if args.device == "cpu" else [*MANY])
+  names = names[:1] if args.short else names
+  keys = {key: getattr(args, key) for key in ("seconds", "against", "episodes", "device", "worlds")}
   return [[{"case": name, "task": name} | keys for name in names]]
 
 
 def run(case: Case, out: pathlib.Path) -> list[Row]:
-  """Returns the row of an exercise."""
+  """Returns the row of an exercise, or the two of one in many worlds."""
   name, clock = case["task"], time.process_time
+  if case["device"] != "cpu":
+    return many(name, case["device"], case["worlds"] or MANY.get(name, 256))
   env = tasks.load(*suite.split(name), {"random": 0})
   act = performer.make(env)
   stepping, recording, steps = 0.0, 0.0, 0
@@ -151,6 +166,65 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return [row | (race(name, case["against"], case["episodes"]) if case["against"] else none)]
 
 
+def many(task: str, device: str, nworld: int) -> list[Row]:
+  """Returns the rows of an exercise in many worlds, without and with runs that repeat."""
+  options = {"device": device, "output": "warp"}
+  envs = [Exercises(nworld, task, deterministic=bool(k), **options) for k in range(2)]
+  random, shape = np.random.RandomState(0), envs[0].action_space.shape
+  drawn = np.clip(random.normal(0.0, 0.4, (STEPS, *shape)), -1, 1)
+  drawn[..., 3] = np.clip(drawn[..., 3] + 0.3, -1, 1)  # towards the organ
+  actions = [wp.array(row, dtype=wp.float32, device=device) for row in drawn]
+
+  def play(env: Exercises) -> np.ndarray:
+    env.reset(seed=0)
+    for action in actions:
+      seen, *_ = env.step(action)
+    return np.concatenate([x.numpy().reshape(nworld, -1) for x in seen.values()], axis=1)
+
+  differ = [int((play(env) != play(env)).any(axis=1).sum()) for env in envs]
+  spent: list[list[float]] = [[], []]
+  for _ in range(TURNS):
+    for env, times in zip(envs, spent, strict=True):
+      start = time.perf_counter()
+      for action in actions[: STEPS // 5]:
+        env.step(action)
+      wp.synchronize_device(device)
+      times.append(time.perf_counter() - start)
+  return [
+    {"task": task, "device": device, "nworld": nworld, "repeat": bool(k)}
+    | {"steps_per_s": round(nworld * (STEPS // 5) / float(np.median(spent[k])))}
+    | {"differ": differ[k], "palpate": palpate.__version__, "mujoco": mujoco.__version__}
+    for k in range(2)
+  ]
+
+
+def compare(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page of exercises in many worlds."""
+  pairs = list(zip(rows[::2], rows[1::2], strict=True))
+  times = [free["steps_per_s"] / same["steps_per_s"] for free, same in pairs]
+  table = [
+    [free["task"], free["nworld"], free["steps_per_s"], same["steps_per_s"], f"{more:.2f}",
+     free["differ"], same["differ"]]
+    for (free, same), more in zip(pairs, times, strict=True)
+  ]  # fmt: skip
+  head = ["exercise", "worlds", "control steps a second", "repeating", "times as long",
+          "worlds that differ", "repeating"]  # fmt: skip
+  text = (
+    f"Random actions towards the organ. Worlds are compared by all that is observed after {STEPS} "
+    f"control steps, which are run twice. Times are medians of {TURNS} stretches of "
+    f"{STEPS // 5} control steps, of both in turn. "
+  )
+  lines = [text + results.link(out / "exercises_cuda.csv"), "", *plots.table(head, table)]
+  found = [
+    f"Runs that repeat take {min(times):.2f} to {max(times):.2f} times as long.",
+    f"Of their worlds {sum(same['differ'] for _, same in pairs)} differ between two runs; without "
+    f"`deterministic=True` {sum(free['differ'] for free, _ in pairs)} of "
+    f"{sum(free['nworld'] for free, _ in pairs)} do.",
+  ]
+  title = "How fast exercises run in many worlds"
+  return [results.page(out / "exercises_cuda.md", title, about, lines, found)]
+
+
 def finding(rows: list[Row]) -> list[str]:
   """Returns what the page begins with."""
   if not rows:
@@ -167,6 +241,8 @@ def finding(rows: list[Row]) -> list[str]:
 
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
+  if rows and "repeat" in rows[0]:
+    return compare(rows, about, out)
   raced = all(row["times"] for row in rows)
   table = [
     [r["task"], r["nodes"], f"{r['steps_per_s']:.0f}", f"{r['metrics_percent']:.1f} %"]
@@ -193,4 +269,4 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   return [picture, results.page(out / "exercises.md", title, about, lines, finding(rows), picture)]
 
 
-BENCH = Bench("speed", stages, run, report=report, arguments=arguments, file="exercises_cpu")
+BENCH = Bench("speed", stages, run, report=report, arguments=arguments, file="exercises_{device}")
