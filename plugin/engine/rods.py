@@ -26,6 +26,9 @@ from .model import declare, flexes, mjstruct, prepare
 from .workspace import Report, Seen
 
 _MOST_ROWS = 48  # of MuJoCo's constraints, for one node
+_MOST_PAIRS = 32  # of edges near each other, for one node
+_SOFT = 0.05  # modulus across a thread over that along it, an estimate
+_SLOW = 1e-4  # velocity below which friction within a thread is viscous [m/s]
 _MUJOCOS = ("jacobian", "flex_margin", "qvel", "qacc_warmstart")
 _HUGE = 1e6  # more than any twist [rad]
 
@@ -39,7 +42,14 @@ class Rod:
   newton: int  # most iterations of a step
   twists: int  # whether it resists twisting
   most_rows: int  # MuJoCo's rows that there is room for
+  collides: int  # whether it meets itself
+  most_pairs: int  # pairs of its edges that there is room for
   shortest: float  # length of its shortest edge [m]
+  longest: float  # of its longest one [m]
+  radius: float  # of its section [m]
+  hardness: float  # of its section, of the barrier between edges [N/m]
+  friction: float  # of the thread on itself
+  slow: float  # velocity below which friction is viscous [m/s]
   length: doubles("nnode")  # rest length of an edge [m]
   stretch: doubles("nnode")  # E A / length of an edge [N/m]
   bend: doubles("nnode")  # E I over the length of a node [N m]
@@ -65,10 +75,17 @@ class Rod:
   move: doubles("nunknown")  # change of the unknowns
   trial: doubles("nunknown")  # scratch
   gradient: doubles("nunknown")  # of what a step makes least
-  matrix: doubles("nunknown", 11)  # its second derivative, and the factors of that
-  inverse: doubles("nunknown", 11)  # of the matrix without constraints, in the band
+  matrix: doubles("nentry")  # its second derivative, and the factors of that, see `Envelope`
+  inverse: doubles("nentry")  # of the matrix without constraints, there
+  first: ints("nunknown")  # first column of each row
+  start_of_row: ints("nunknown")  # where it is
+  below: ints("nunknown")  # scratch
   status: ints(1)  # iterations, or -1: not finite
-  count: ints(1)  # rows of constraints that act on the rod
+  count: ints(3)  # rows of constraints that act on the rod; pairs of edges listed; entries
+  listed: doubles("nnode", 3)  # place where these were listed [m]
+  pair: ints("npair", 2)  # the two edges
+  pressure: doubles("npair")  # force between them as the step begins [N]
+  touch: doubles("npair", 5)  # where it acts on each, as weights, and the normal
   row_kind: ints("nrow")  # see `RowKind`
   row_node: ints("nrow")  # the first of the two nodes
   row_value: doubles("nrow", 9)  # J of their dofs; J a of other bodies less aref; D; friction
@@ -227,6 +244,12 @@ class Workspace:
       flex=organ.flex,
       newton=organ.config.iterations,
       most_rows=_MOST_ROWS * n,
+      most_pairs=_MOST_PAIRS * n,
+      collides=1,
+      radius=organ.radius,
+      hardness=_SOFT * float(np.mean(organ.config.young)) * organ.radius,
+      friction=float(mjstruct.view(m.flex_friction, (m.nflex, 3))[organ.flex, 0]),
+      slow=_SLOW,
       mass=mass,
       held=held.ravel(),
       rest=organ.rest,
@@ -238,11 +261,16 @@ class Workspace:
       frame=organ.frame,
       **{name: np.zeros((n, 3)) for name in ("start", "vel", "external", "aim", "place")},
       **{name: np.zeros(4 * n) for name in ("force", "move", "trial", "gradient")},
-      matrix=np.zeros((4 * n, 11)),
-      inverse=np.zeros((4 * n, 11)),
+      matrix=np.zeros(2 * n * (4 * n + 1)),
+      inverse=np.zeros(2 * n * (4 * n + 1)),
+      **{name: np.zeros(4 * n) for name in ("first", "start_of_row", "below")},
+      listed=np.zeros((n, 3)),
+      pair=np.zeros((_MOST_PAIRS * n, 2)),
+      pressure=np.zeros(_MOST_PAIRS * n),
+      touch=np.zeros((_MOST_PAIRS * n, 5)),
       turn=np.zeros(n),
       status=np.zeros(1),
-      count=np.zeros(1),
+      count=np.zeros(3),
       row_kind=np.zeros(_MOST_ROWS * n),
       row_node=np.zeros(_MOST_ROWS * n),
       row_value=np.zeros((_MOST_ROWS * n, 9)),

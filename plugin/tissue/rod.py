@@ -69,6 +69,7 @@ def constants(
     "nnode": n,
     "twists": int(config.twist > 0),
     "shortest": float(length.min()),
+    "longest": float(length.max()),
     "length": np.append(length, 0.0),
     "stretch": np.append(young * area / length, 0.0),
     "bend": bend,

@@ -119,15 +119,19 @@ PALPATE void gather_rod(const Fields& f, double h) {
     store(f.start.data + 3 * i, x);
     store(f.vel.data + 3 * i, v);
     store(f.external.data + 3 * i, force);
-    store(f.place.data + 3 * i, x + h * v);
   }
+}
+
+template <class Fields>
+PALPATE Envelope inverse_of(const Fields& f) {
+  return {f.inverse.data, f.first.data, f.start_of_row.data, 4 * f.nnode};
 }
 
 // The inertia that a node alone has in the rod's step, from the inverse of its matrix; no less than its mass.
 template <class Fields>
 PALPATE double alone(const Fields& f, int i, double h) {
   double trace = 0.0;
-  for (int c = 0; c < 3; ++c) trace += entry(f.inverse.data, 4 * i + c, 4 * i + c);
+  for (int c = 0; c < 3; ++c) trace += inverse_of(f).at(4 * i + c, 4 * i + c);
   const double found = 3.0 * h * h / trace, mass = f.mass.data[i];
   return found > mass ? found : mass;
 }
@@ -144,14 +148,15 @@ PALPATE void begin_rod(const Fields& f, Thread, int) {
   const bool ok = f.status.data[0] >= 0, touched = ok && f.count.data[0] > 0;
   if (!ok)  // holds still for this step instead of spreading the damage
     for (int a = 0; a < 3 * f.nnode; ++a) f.place.data[a] = f.start.data[a];
-  for (int a = 0; a < n; ++a) f.force.data[a] = 0.0;
   if (touched) {
-    for (int a = 0; a < WIDTH * n; ++a) f.matrix.data[a] = 0.0;
-    rows_cost(f, f.place.data, h, f.force.data, f.matrix.data);
-    assemble(f, f.place.data, f.turn.data, h, f.gradient.data, f.matrix.data);
-    hold(f, f.gradient.data, f.matrix.data);
-    factorize(f.matrix.data, n);
-    invert_in_band(f.matrix.data, f.inverse.data, n);
+    lay_out(f, f.place.data);
+    const Envelope H = matrix_of(f);
+    for (int a = 0; a < n; ++a) f.force.data[a] = 0.0;
+    rows_cost(f, f.place.data, h, f.force.data, &H);
+    assemble(f, f.place.data, f.turn.data, h, f.gradient.data);
+    hold(f, f.gradient.data, H);
+    factorize(H, f.trial.data);
+    invert_there(H, inverse_of(f), f.below.data);
   }
   for (int i = 0; i < f.nnode; ++i) {
     const int adr = f.dofadr.data[i];
@@ -165,7 +170,8 @@ PALPATE void begin_rod(const Fields& f, Thread, int) {
     const D3 dv = (1.0 / h) * (load(f.place.data + 3 * i) - load(f.start.data + 3 * i)) - load(f.vel.data + 3 * i);
     const D3 rate = (1.0 / h) * D3{Mhat.x * dv.x, Mhat.y * dv.y, Mhat.z * dv.z};
     double* out = mj.qfrc_passive.data + adr;
-    store(out, load(out) + passive(rate, load(f.external.data + 3 * i) - load(f.force.data + 4 * i)));
+    const D3 lagged = load(f.external.data + 3 * i) - (touched ? load(f.force.data + 4 * i) : D3{0.0, 0.0, 0.0});
+    store(out, load(out) + passive(rate, lagged));
   }
 }
 
@@ -181,10 +187,11 @@ PALPATE void end_rod(const Fields& f, Thread, int) {
       store(f.move.data + 4 * i, adr < 0 ? found : found + load(f.force.data + 4 * i));
       f.move.data[4 * i + 3] = 0.0;
     }
-    solve_factorized(f.matrix.data, f.move.data, 4 * f.nnode);
+    solve_factorized(matrix_of(f), f.move.data);
+    const double part = safe_part(f, f.place.data, f.move.data, 4);
     for (int i = 0; i < f.nnode; ++i) {
-      store(f.place.data + 3 * i, load(f.place.data + 3 * i) + load(f.move.data + 4 * i));
-      f.turn.data[i] += f.move.data[4 * i + 3];
+      store(f.place.data + 3 * i, load(f.place.data + 3 * i) + part * load(f.move.data + 4 * i));
+      f.turn.data[i] += part * f.move.data[4 * i + 3];
     }
   }
   for (int i = 1; i + 1 < f.nnode && f.twists; ++i) f.trial.data[i] = twist_at(f, f.place.data, f.turn.data, i);

@@ -6,7 +6,7 @@
 // takes part in (Todorov 2014, doi:10.1109/ICRA.2014.6907751), with the rod's own stiffness in place of
 // MuJoCo's inertia. A row's dofs are those of two neighbouring nodes, so the matrix stays banded.
 #pragma once
-#include "tissue/rod.h"
+#include "tissue/rod_contact.h"
 
 AS_WRITTEN
 
@@ -47,16 +47,16 @@ struct RodRow {
 
 // Adds force J to a gradient by place, and stiffness J J^T to the matrix.
 template <class Fields>
-PALPATE void add_row(const Fields&, int node, const double* J, double force, double stiffness, double* g, double* H) {
+PALPATE void add_row(const Fields&, int node, const double* J, double force, double stiffness, double* g, const Envelope* H) {
   const double v[7] = {J[0], J[1], J[2], 0.0, J[3], J[4], J[5]};
   const int n = J[3] == 0.0 && J[4] == 0.0 && J[5] == 0.0 ? 3 : 7;
-  add_term(g, H, 4 * node, v, n, force, stiffness);
+  add_term(g, *H, 4 * node, v, n, force, stiffness);
 }
 
 // The cost of a cone (MuJoCo, Computation, elliptic cones) whose first row is r; adds its gradient and
 // second derivative where there are a gradient and a matrix.
 template <class Fields>
-PALPATE double cone(const Fields& f, int r, int dim, const double* x, double h, double* g, double* H) {
+PALPATE double cone(const Fields& f, int r, int dim, const double* x, double h, double* g, const Envelope* H) {
   const RodRow<Fields> first{f, r};
   const double mu = first.friction(), per = 1.0 / (h * h);
   double u[6], slope[6], T2 = 0.0, cost = 0.0;
@@ -101,7 +101,7 @@ PALPATE double cone(const Fields& f, int r, int dim, const double* x, double h, 
 
 // The cost of all rows; adds its gradient and second derivative where there are a gradient and a matrix.
 template <class Fields>
-PALPATE double rows_cost(const Fields& f, const double* x, double h, double* g, double* H) {
+PALPATE double rows_cost(const Fields& f, const double* x, double h, double* g, const Envelope* H) {
   double cost = 0.0;
   const int n = f.count.data[0];
   for (int r = 0; r < n;) {
@@ -129,38 +129,49 @@ PALPATE double step_cost(const Fields& f, const double* x, const double* turn, d
     const D3 off = load(x + 3 * i) - load(f.aim.data + 3 * i);
     sum += 0.5 * f.mass.data[i] / (h * h) * dot(off, off) + 0.5 * f.spin.data[i] / (h * h) * turn[i] * turn[i];
   }
-  return sum + rod_energy(f, x, turn) + h * h * rows_cost(f, x, h, (double*)nullptr, (double*)nullptr);
+  return sum + rod_energy(f, x, turn) + contacts_energy(f, x, h, nullptr, nullptr) +
+         h * h * rows_cost(f, x, h, nullptr, nullptr);
 }
 
 // The gradient and the matrix at a trial state, without the constraints' part.
 template <class Fields>
-PALPATE void assemble(const Fields& f, const double* x, const double* turn, double h, double* g, double* H) {
-  const int n = 4 * f.nnode;
-  for (int a = 0; a < n; ++a) g[a] = 0.0;
-  for (int a = 0; a < WIDTH * n; ++a) H[a] = 0.0;
+PALPATE void assemble(const Fields& f, const double* x, const double* turn, double h, double* g) {
+  lay_out(f, x);
+  const Envelope H = matrix_of(f);
+  for (int a = 0; a < H.n; ++a) g[a] = 0.0;
+  for (int a = 0; a < f.count.data[2]; ++a) H.value[a] = 0.0;
   for (int i = 0; i < f.nnode; ++i) {
     for (int c = 0; c < 3; ++c) {
       const double m = f.mass.data[i] / (h * h);
       g[4 * i + c] = m * (x[3 * i + c] - f.aim.data[3 * i + c]);
-      entry(H, 4 * i + c, 4 * i + c) = m;
+      H.at(4 * i + c, 4 * i + c) = m;
     }
     g[4 * i + 3] = f.spin.data[i] / (h * h) * turn[i];
-    entry(H, 4 * i + 3, 4 * i + 3) = f.spin.data[i] / (h * h);
+    H.at(4 * i + 3, 4 * i + 3) = f.spin.data[i] / (h * h);
   }
   add_rod(f, x, turn, g, H);
+  contacts_energy(f, x, h, g, &H);
 }
 
 // Takes unknowns out that do not change.
 template <class Fields>
-PALPATE void hold(const Fields& f, double* g, double* H) {
-  const int n = 4 * f.nnode;
-  for (int a = 0; a < n; ++a) {
+PALPATE void hold(const Fields& f, double* g, const Envelope& H) {
+  for (int a = 0; a < H.n; ++a) {
+    double* row = H.row(a);
+    for (int b = H.first[a]; b <= a; ++b)
+      if (f.held.data[a] || f.held.data[b]) row[b] = 0.0;
     if (!f.held.data[a]) continue;
     g[a] = 0.0;
-    for (int b = first_in_band(a); b < a; ++b) entry(H, a, b) = 0.0;
-    for (int b = a + 1; b < n && b <= a + BAND; ++b) entry(H, b, a) = 0.0;
-    entry(H, a, a) = 1.0;
+    row[a] = 1.0;
   }
+}
+
+// Starts from where the nodes move by themselves, as far as they do not meet.
+template <class Fields>
+PALPATE void predict(const Fields& f, double h) {
+  for (int a = 0; a < 3 * f.nnode; ++a) f.trial.data[a] = h * f.vel.data[a];
+  const double part = safe_part(f, f.start.data, f.trial.data, 3);
+  for (int a = 0; a < 3 * f.nnode; ++a) f.place.data[a] = f.start.data[a] + part * f.trial.data[a];
 }
 
 // Takes the step from f.start and f.vel: f.place and f.turn are where it ends, f.predicted the force of
@@ -171,18 +182,26 @@ PALPATE int step_rod(const Fields& f, double h) {
   double* x = f.place.data;
   double* turn = f.turn.data;
   double* g = f.gradient.data;
-  double* H = f.matrix.data;
   double* trial = f.trial.data;
   double* trial_turn = f.trial.data + 3 * f.nnode;
+  list_pairs(f, f.start.data);
+  note_pressure(f);
+  predict(f, h);
   double cost = step_cost(f, x, turn, h);
   int iteration = 0;
   for (; iteration < f.newton; ++iteration) {
-    assemble(f, x, turn, h, g, H);
-    rows_cost(f, x, h, g, H);
+    if (is_stale(f, x)) {
+      list_pairs(f, x);
+      note_pressure(f);
+      cost = step_cost(f, x, turn, h);
+    }
+    assemble(f, x, turn, h, g);
+    const Envelope H = matrix_of(f);
+    rows_cost(f, x, h, g, &H);
     hold(f, g, H);
     for (int a = 0; a < n; ++a) f.move.data[a] = -g[a];
-    factorize(H, n);
-    solve_factorized(H, f.move.data, n);
+    factorize(H, f.trial.data);
+    solve_factorized(H, f.move.data);
     double falls = 0.0, most = 0.0;
     for (int a = 0; a < n; ++a) falls += g[a] * f.move.data[a];
     for (int i = 0; i < f.nnode; ++i) {
@@ -190,7 +209,8 @@ PALPATE int step_rod(const Fields& f, double h) {
       most = far > most ? far : most;
     }
     if (!(falls == falls) || !(most < 1e6)) return -1;
-    double part = 1.0;
+    const double whole = safe_part(f, x, f.move.data, 4);
+    double part = whole;
     for (int k = 0; k < HALVINGS; ++k, part *= 0.5) {
       for (int i = 0; i < f.nnode; ++i) {
         store(trial + 3 * i, load(x + 3 * i) + part * load(f.move.data + 4 * i));
@@ -204,7 +224,8 @@ PALPATE int step_rod(const Fields& f, double h) {
     }
     for (int a = 0; a < 3 * f.nnode; ++a) x[a] = trial[a];
     for (int i = 0; i < f.nnode; ++i) turn[i] = trial_turn[i];
-    if (part * most < CLOSE * f.shortest) return iteration + 1;
+    // A move that was cut short by contacts is not the last one.
+    if (part * most < CLOSE * f.shortest && whole == 1.0) return iteration + 1;
   }
   return iteration;
 }

@@ -7,7 +7,7 @@
 // tangents.
 #pragma once
 #include "core/triangle.h"
-#include "solver/banded.h"
+#include "solver/envelope.h"
 
 AS_WRITTEN
 
@@ -79,19 +79,22 @@ PALPATE double rod_energy(const Fields& f, const double* x, const double* turn) 
 }
 
 // Adds force * v to a gradient and stiffness v v^T to a matrix, v of `n` entries from unknown `at` on.
-PALPATE void add_term(double* g, double* H, int at, const double* v, int n, double force, double stiffness) {
+PALPATE void add_term(
+    double* g, const Envelope& H, int at, const double* v, int n, double force, double stiffness) {
   for (int a = 0; a < n; ++a) {
+    if (v[a] == 0.0) continue;
     g[at + a] += force * v[a];
     const double s = stiffness * v[a];
-    double* row = H + WIDTH * (at + a) + BAND - a;
-    for (int b = 0; b <= a; ++b) row[b] += s * v[b];
+    double* row = H.row(at + a) + at;
+    for (int b = 0; b <= a; ++b)
+      if (v[b] != 0.0) row[b] += s * v[b];
   }
 }
 
 // Adds the gradient of the energy, and of its second derivative what is positive: that of the squares
 // (Gauss and Newton), and the tension of edges.
 template <class Fields>
-PALPATE void add_rod(const Fields& f, const double* x, const double* turn, double* g, double* H) {
+PALPATE void add_rod(const Fields& f, const double* x, const double* turn, double* g, const Envelope& H) {
   for (int i = 0; i + 1 < f.nnode; ++i) {
     const D3 e = load(x + 3 * i + 3) - load(x + 3 * i);
     const double l = norm(e) + 1e-300, k = f.stretch.data[i], tension = k * (l - f.length.data[i]);
@@ -100,9 +103,9 @@ PALPATE void add_rod(const Fields& f, const double* x, const double* turn, doubl
     const double across = tension > 0.0 ? tension / l : 0.0;
     add_term(g, H, 4 * i, v, 7, tension, k - across);
     for (int c = 0; c < 3; ++c) {
-      entry(H, 4 * i + c, 4 * i + c) += across;
-      entry(H, 4 * i + 4 + c, 4 * i + 4 + c) += across;
-      entry(H, 4 * i + 4 + c, 4 * i + c) -= across;
+      H.at(4 * i + c, 4 * i + c) += across;
+      H.at(4 * i + 4 + c, 4 * i + 4 + c) += across;
+      H.at(4 * i + 4 + c, 4 * i + c) -= across;
     }
   }
   for (int i = 1; i + 1 < f.nnode; ++i) {
