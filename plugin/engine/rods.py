@@ -26,6 +26,9 @@ from .model import declare, flexes, mjstruct, prepare
 from .workspace import Report, Seen
 
 _MOST_ROWS = 48  # of MuJoCo's constraints, for one node
+# Centre lines come no nearer than this share of the diameter; neighbours along the thread, with no
+# more than this many radii between them, are not looked at.
+CORE, NEIGHBOURS = 0.5, 3.5
 _MOST_PAIRS = 32  # of edges near each other, for one node
 _SOFT = 0.05  # modulus across a thread over that along it, an estimate
 _SLOW = 1e-4  # velocity below which friction within a thread is viscous [m/s]
@@ -62,6 +65,7 @@ class Rod:
   qposadr: ints("nnode")  # its first number in qpos
   bodyid: ints("nnode")  # its body
   massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
+  diagonal: ints("nv")  # where M has the diagonal of a dof
   own_dof: ints("nv")  # number of a dof in the rod: three times the node, and the axis; or -1
   frame: doubles(3, 3)  # rotation from the slides' axes to the world
   # A step:
@@ -82,6 +86,7 @@ class Rod:
   below: ints("nunknown")  # scratch
   status: ints(1)  # iterations, or -1: not finite
   count: ints(3)  # rows of constraints that act on the rod; pairs of edges listed; entries
+  reach: doubles(1)  # how far these may be apart before they touch [m]
   listed: doubles("nnode", 3)  # place where these were listed [m]
   pair: ints("npair", 2)  # the two edges
   pressure: doubles("npair")  # force between them as the step begins [N]
@@ -100,8 +105,9 @@ class Rod:
   qacc_warmstart: doubles("nv")
 
 
+_CONSTANTS = contacts.CONSTANTS | {"CORE": CORE, "NEIGHBOURS": NEIGHBOURS}
 begin, end = (
-  kernel(name, "coupling/rod.h", Rod, contacts.CONSTANTS) for name in ("begin_rod", "end_rod")
+  kernel(name, "coupling/rod.h", Rod, _CONSTANTS) for name in ("begin_rod", "end_rod")
 )
 
 
@@ -176,15 +182,14 @@ def read(model: int, instance: int) -> Declaration:
     )
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[flex])
   rod.check_edges(name, np.linalg.norm(np.diff(rest, axis=0), axis=1), radius)
+  rod.check_apart(name, rest, radius, NEIGHBOURS * radius, 2 * CORE * radius)
   texts = declare.keys(model, instance)
   try:
     config = configuration.parse(name, texts, len(edge), closed=False)
   except ValueError as error:
     raise ValueError(str(error).replace("organ ", "thread ", 1)) from None
   dofadr, qposadr = declare.addresses(m, name, body, free)
-  return Declaration(
-    name, flex, config, radius, rest, free, body, dofadr, qposadr, frame, origin
-  )
+  return Declaration(name, flex, config, radius, rest, free, body, dofadr, qposadr, frame, origin)
 
 
 def _check(m, flex: int, name: str):
@@ -257,6 +262,7 @@ class Workspace:
       qposadr=organ.qposadr,
       bodyid=organ.body,
       massadr=np.where(organ.free[:, None], coupling.mass_addresses(m, dofs), -1),
+      diagonal=coupling.mass_addresses(m, np.arange(m.nv)),
       own_dof=own_dof,
       frame=organ.frame,
       **{name: np.zeros((n, 3)) for name in ("start", "vel", "external", "aim", "place")},
@@ -264,6 +270,7 @@ class Workspace:
       matrix=np.zeros(2 * n * (4 * n + 1)),
       inverse=np.zeros(2 * n * (4 * n + 1)),
       **{name: np.zeros(4 * n) for name in ("first", "start_of_row", "below")},
+      reach=np.zeros(1),
       listed=np.zeros((n, 3)),
       pair=np.zeros((_MOST_PAIRS * n, 2)),
       pressure=np.zeros(_MOST_PAIRS * n),

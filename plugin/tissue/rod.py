@@ -17,6 +17,41 @@ def check_edges(name: str, length: np.ndarray, radius: float):
     )
 
 
+def check_apart(name: str, x: np.ndarray, radius: float, between: float, core: float):
+  """Raises ValueError where edges that are no neighbours begin nearer than can be.
+
+  Args:
+    name: of the thread
+    x: nodes [m]                                                         (nnode, 3)
+    radius: of the thread [m]
+    between: length of thread between edges that are no neighbours [m]
+    core: least distance of their centre lines [m]
+  """
+  edge = np.diff(x, axis=0)
+  length = np.linalg.norm(edge, axis=1)
+  along = np.append(0.0, np.cumsum(length))
+  i, j = np.triu_indices(len(edge), 2)
+  middle = 0.5 * (x[1:] + x[:-1])
+  near = along[j] - along[i + 1] >= between
+  near &= np.linalg.norm(middle[i] - middle[j], axis=1) < core + 0.5 * (length[i] + length[j])
+  i, j = i[near], j[near]
+  # As `nearest` in native/tissue/rod_contact.h.
+  p, d, q, e = x[i], edge[i], x[j], edge[j]
+  r = p - q
+  a, b, c = ((u * v).sum(axis=1) for u, v in ((d, d), (d, e), (e, e)))
+  f, g = (e * r).sum(axis=1), (d * r).sum(axis=1)
+  det = np.maximum(a * c - b * b, 1e-9 * a * c)
+  t = np.clip((b * np.clip((b * f - g * c) / det, 0, 1) + f) / c, 0, 1)
+  s = np.clip((b * t - g) / a, 0, 1)
+  far = np.linalg.norm(r + s[:, None] * d - t[:, None] * e, axis=1)
+  if far.min(initial=np.inf) <= core:
+    k = int(far.argmin())
+    raise ValueError(
+      f"thread {name!r}: edges {i[k]} and {j[k]} begin {1e3 * far[k]:.3g} mm from each other and "
+      f"radius is {1e3 * radius:.3g} mm, expected a thread that does not go through itself"
+    )
+
+
 def tension(constants: dict, x: np.ndarray) -> np.ndarray:
   """Returns the tension of the edges [N], (nnode - 1,), at places x [m], (nnode, 3)."""
   length = np.linalg.norm(np.diff(x, axis=0), axis=1)

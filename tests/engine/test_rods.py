@@ -108,9 +108,7 @@ def test_a_twisted_rod_buckles_at_greenhills_twist(share, buckles):
   n, length = 41, 0.04
   edge = length / (n - 1)
   pins = (0, 1, n, n + 1)
-  model, data, thread = load(
-    line(n + 2, length + 2 * edge, -edge), pin=pins, h=0.05, option=FREE
-  )
+  model, data, thread = load(line(n + 2, length + 2 * edge, -edge), pin=pins, h=0.05, option=FREE)
   critical = 2 * 4.4934 * (1 + POISSON)
   for _ in range(40):
     thread.turn(n, share * critical / 40)
@@ -283,6 +281,8 @@ def test_a_foreign_state_is_refused():
   ("kwargs", "message"),
   [
     (dict(points=line(5, 3e-4)), r"edge \d is 0.075 mm long and radius is 0.1 mm"),
+    (dict(points=[[0, 0, 0], [9e-3, 0, 0], [9e-3, 9e-3, 0], [5e-3, 9e-3, 0], [5e-3, -9e-3, 0]]),
+     "edges 0 and 3 begin 0 mm from each other and radius is 0.1 mm"),
     (dict(points=line(5, 0.01), thickness=0.001), "thickness is set and elements is 'rod'"),
     (dict(points=line(5, 0.01), twist=-1), "thread 't': twist is '-1', expected a number >= 0"),
     (dict(points=line(5, 0.01), option='integrator="RK4"'), "RK4"),

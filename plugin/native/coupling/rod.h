@@ -1,14 +1,15 @@
 // The coupling of a rod to MuJoCo.
 //
 // The rod's step is taken with the constraints that MuJoCo has found for this step, on bodies that move on as
-// they did. So it reaches MuJoCo as a force on its nodes,
+// they did; those that an equality joins to it yield to its force. So it reaches MuJoCo as a force on its nodes,
 //
 //   qfrc_passive = Mhat (v1 - v) / h - f_ext - f_c,
 //
 // with f_c the force of the constraints in the rod's step and Mhat the inertia that one node alone has
-// in it. MuJoCo's solver, for which Mhat is the nodes' inertia, finds f_c again unless other bodies move otherwise;
-// by what it differs the rod then moves on by its own response. Too great an inertia does no harm here: with A
-// the rod's own and M the body's, an error of a body's motion becomes (Mhat - A) / (M + Mhat) of it, less than 1.
+// in it. MuJoCo's solver, for which Mhat is the nodes' inertia, finds f_c again unless other bodies move
+// otherwise; by what it differs the rod then moves on by its own response. Too great an inertia does no harm
+// here: with A the rod's own and M the body's, an error of a body's motion becomes (Mhat - A) / (M + Mhat)
+// of it, less than 1.
 #pragma once
 #include "coupling/contact_rows.h"
 #include "coupling/node.h"
@@ -42,17 +43,31 @@ PALPATE bool note_row(const Fields& f, int r, int kind, double friction) {
   const double* kbip = datum<double*>(f, DATA_EFC_KBIP) + 4 * r;
   const double gap = datum<double*>(f, DATA_EFC_POS)[r] - datum<double*>(f, DATA_EFC_MARGIN)[r];
   double sum = kbip[1] * velocity(f, r) + kbip[0] * kbip[2] * gap;  // -aref
+  double yields = 0.0;  // how another body gives way to the row's force [1/kg]
   for (int k = 0; k < DOFS; ++k) J[k] = 0.0;
   for (int k = 0; k < row.count; ++k) {
     if (row.value[k] == 0.0) continue;
     const int dof = row.dof ? row.dof[k] : k, own = f.own_dof.data[dof];
     if (own >= 0)
       J[own - 3 * node] = row.value[k];
-    else
+    else {
       sum += row.value[k] * f.qacc_warmstart.data[dof];
+      yields += row.value[k] * row.value[k] / f.mj.M.data[f.diagonal.data[dof]];
+    }
+  }
+  double D = datum<double*>(f, DATA_EFC_D)[r];
+  if (kind == BOTH) {  // its last acceleration is without the row's last force, then it yields to the new one
+    double before = 0.0, length2 = 0.0;
+    for (int k = 0; k < DOFS; ++k) {
+      if (J[k] == 0.0) continue;
+      before += J[k] * f.own.force.data[3 * node + k];
+      length2 += J[k] * J[k];
+    }
+    sum -= yields * before / length2;
+    D /= 1.0 + D * yields;
   }
   J[DOFS] = sum;
-  J[DOFS + 1] = datum<double*>(f, DATA_EFC_D)[r];
+  J[DOFS + 1] = D;
   J[DOFS + 2] = friction;
   f.row_node.data[at] = node;
   f.row_kind.data[at] = kind;
@@ -127,13 +142,18 @@ PALPATE Envelope inverse_of(const Fields& f) {
   return {f.inverse.data, f.first.data, f.start_of_row.data, 4 * f.nnode};
 }
 
-// The inertia that a node alone has in the rod's step, from the inverse of its matrix; no less than its mass.
+// The inertia along the axes that a node alone has in the rod's step, from the inverse of its matrix; no less
+// than its mass. With the diagonal of the node's matrix times 3/2, no direction has more than twice it.
 template <class Fields>
-PALPATE double alone(const Fields& f, int i, double h) {
-  double trace = 0.0;
-  for (int c = 0; c < 3; ++c) trace += inverse_of(f).at(4 * i + c, 4 * i + c);
-  const double found = 3.0 * h * h / trace, mass = f.mass.data[i];
-  return found > mass ? found : mass;
+PALPATE D3 alone(const Fields& f, int i, double h) {
+  constexpr double SURE = 1.5;
+  const Envelope Z = inverse_of(f);
+  D3 row[3];
+  for (int a = 0; a < 3; ++a)
+    row[a] = {Z.at(4 * i + a, 4 * i), Z.at(4 * i + a, 4 * i + 1), Z.at(4 * i + a, 4 * i + 2)};
+  const double det = dot(row[0], cross(row[1], row[2])), scale = SURE * h * h / det, mass = f.mass.data[i];
+  const D3 found = {scale * cross(row[1], row[2]).x, scale * cross(row[2], row[0]).y, scale * cross(row[0], row[1]).z};
+  return vmax(found, {mass, mass, mass});
 }
 
 // Takes the rod's step, and adds the passive force that brings it through MuJoCo's.
@@ -163,10 +183,7 @@ PALPATE void begin_rod(const Fields& f, Thread, int) {
     if (adr < 0) continue;
     const int* at = f.massadr.data + 3 * i;
     D3 Mhat = {mj.M.data[at[0]], mj.M.data[at[1]], mj.M.data[at[2]]};
-    if (touched) {
-      const double inertia = alone(f, i, h);
-      set_inertia(mj, at, adr, Mhat = {inertia, inertia, inertia});
-    }
+    if (touched) set_inertia(mj, at, adr, Mhat = alone(f, i, h));
     const D3 dv = (1.0 / h) * (load(f.place.data + 3 * i) - load(f.start.data + 3 * i)) - load(f.vel.data + 3 * i);
     const D3 rate = (1.0 / h) * D3{Mhat.x * dv.x, Mhat.y * dv.y, Mhat.z * dv.z};
     double* out = mj.qfrc_passive.data + adr;
@@ -199,6 +216,7 @@ PALPATE void end_rod(const Fields& f, Thread, int) {
   for (int i = 0; i < f.nnode; ++i) {
     const int adr = f.dofadr.data[i];
     if (adr < 0) continue;
+    store(f.own.force.data + 3 * i, load(mj.qfrc_constraint.data + adr));
     const D3 moved = load(f.place.data + 3 * i) - load(f.start.data + 3 * i);
     const D3 q = load(f.start.data + 3 * i) - load(f.rest.data + 3 * i) + load(mj.qpos0.data + f.qposadr.data[i]);
     store(mj.qpos.data + f.qposadr.data[i], q + moved);

@@ -184,6 +184,7 @@ PALPATE int step_rod(const Fields& f, double h) {
   double* g = f.gradient.data;
   double* trial = f.trial.data;
   double* trial_turn = f.trial.data + 3 * f.nnode;
+  f.reach.data[0] = reach_of(f, h);
   list_pairs(f, f.start.data);
   note_pressure(f);
   predict(f, h);

@@ -7,14 +7,11 @@ AS_WRITTEN
 
 namespace palpate {
 
-// Centre lines come no nearer than this share of the diameter; the force rises without bound there.
-constexpr double CORE = 0.5;
-// Of a neighbour along the rod, the length between that is not looked at, in radii.
-constexpr double NEIGHBOURS = 3.5;
-// Of the room before two edges meet, the share that an iteration may take.
-constexpr double ROOM = 0.8;
-// How far two edges that are listed may be apart before they touch, in radii.
-constexpr double LISTED = 6.0;
+// Of the room before two edges meet, the share that an iteration leaves; how near to that it is found.
+constexpr double LEFT = 0.2, FOUND = 0.9;
+// How far two edges that are listed may be apart before they touch: in radii, and in what the fastest
+// node goes in a step.
+constexpr double LISTED = 4.0, AHEAD = 3.0;
 
 // The points of two segments, from p along d and from q along e, that are nearest (Ericson 2005, 5.1.9).
 struct Nearest { double s, t; D3 off; };
@@ -51,12 +48,23 @@ PALPATE Barrier barrier(const Fields& f, double distance) {
   return {-k * d * d * l, -k * (2.0 * d * l + d * d / g), -k * (2.0 * l + 4.0 * d / g - d * d / (g * g))};
 }
 
-// Lists the pairs of edges that are near each other at x, and the first columns of the matrix' rows.
+// How far listed edges may be apart, for the velocities that the step begins with.
 template <class Fields>
-PALPATE void list_pairs(const Fields& f, const double* x) {
+PALPATE double reach_of(const Fields& f, double h) {
+  double fastest = 0.0;
+  for (int i = 0; i < f.nnode; ++i) {
+    const double v = norm(load(f.vel.data + 3 * i));
+    fastest = v > fastest ? v : fastest;
+  }
+  return LISTED * f.radius + AHEAD * h * fastest;
+}
+
+// Lists the pairs of edges that are near each other at x; returns whether there is room for all.
+template <class Fields>
+PALPATE bool list_near(const Fields& f, const double* x) {
   const int n = f.nnode;
   int count = 0;
-  const double far = (2.0 + LISTED) * f.radius;
+  const double far = 2.0 * f.radius + f.reach.data[0];
   for (int i = 0; i + 1 < n; ++i) {
     const D3 a = 0.5 * (load(x + 3 * i) + load(x + 3 * i + 3));
     double between = 0.0;
@@ -67,7 +75,8 @@ PALPATE void list_pairs(const Fields& f, const double* x) {
       const double reach = far + f.longest, d2 = dot(a - b, a - b);
       if (d2 > reach * reach) continue;
       const D3 off = nearest_edges(x, i, j).off;
-      if (dot(off, off) > far * far || count >= f.most_pairs) continue;
+      if (dot(off, off) > far * far) continue;
+      if (count >= f.most_pairs) return false;
       f.pair.data[2 * count] = i;
       f.pair.data[2 * count + 1] = j;
       ++count;
@@ -75,6 +84,13 @@ PALPATE void list_pairs(const Fields& f, const double* x) {
   }
   f.count.data[1] = count;
   for (int a = 0; a < 3 * n; ++a) f.listed.data[a] = x[a];
+  return true;
+}
+
+// Lists them, as far away as there is room.
+template <class Fields>
+PALPATE void list_pairs(const Fields& f, const double* x) {
+  while (!list_near(f, x)) f.reach.data[0] *= 0.5;
 }
 
 // The rows' first columns: of two neighbours along the rod, and of what touches at x or began the step so.
@@ -199,7 +215,41 @@ PALPATE double moved_since(const Fields& f, const double* x) {
 // Whether pairs have to be listed again: half of what they may move has gone.
 template <class Fields>
 PALPATE bool is_stale(const Fields& f, const double* x) {
-  return f.collides && moved_since(f, x) > 0.25 * LISTED * f.radius;
+  return f.collides && moved_since(f, x) > 0.3 * f.reach.data[0];
+}
+
+// The points of two edges after part of a move.
+PALPATE Nearest nearest_after(const double* x, const double* move, int stride, int i, int j, double part) {
+  D3 at[4];
+  const int node[4] = {i, i + 1, j, j + 1};
+  for (int k = 0; k < 4; ++k) at[k] = load(x + 3 * node[k]) + part * load(move + stride * node[k]);
+  return nearest(at[0], at[1] - at[0], at[2], at[3] - at[2]);
+}
+
+// How much of a move, no more than `part`, leaves two edges room between them: by steps of which none can
+// be too long (Li et al. 2021, doi:10.1145/3450626.3459767, algorithm 1).
+template <class Fields>
+PALPATE double safe_for(const Fields& f, const double* x, const double* move, int stride, int i, int j, double part) {
+  const double core = 2.0 * CORE * f.radius;
+  double closing = 0.0;  // of their points no two come nearer by more
+  for (int a = 0; a < 2; ++a) {
+    for (int b = 0; b < 2; ++b) {
+      const double far = norm(load(move + stride * (i + a)) - load(move + stride * (j + b)));
+      closing = far > closing ? far : closing;
+    }
+  }
+  double gap = norm(nearest_edges(x, i, j).off) - core;
+  if (part * closing <= (1.0 - LEFT) * gap) return part;
+  const double least = LEFT * gap;
+  double done = 0.0;
+  for (int k = 0; k < 100 && done < part; ++k) {
+    const double next = done + FOUND * (gap - FOUND * least) / closing;
+    if (next >= part) return part;
+    gap = norm(nearest_after(x, move, stride, i, j, next).off) - core;
+    if (gap < least) return done;
+    done = next;
+  }
+  return done;
 }
 
 // How much of a move of all nodes, a distance `stride` apart in `move`, can be taken so that no edges go
@@ -212,16 +262,11 @@ PALPATE double safe_part(const Fields& f, const double* x, const double* move, i
     most = far > most ? far : most;
   }
   if (!f.collides) return part;
-  const double room = 0.5 * LISTED * f.radius - moved_since(f, x);  // for what is not listed
+  const double room = 0.5 * f.reach.data[0] - moved_since(f, x);  // for what is not listed
   if (part * most > room) part = room / most;
   for (int p = 0; p < f.count.data[1]; ++p) {
-    if (f.pressure.data[p] < 0.0) continue;
-    const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
-    const double a0 = norm(load(move + stride * i)), a1 = norm(load(move + stride * (i + 1)));
-    const double b0 = norm(load(move + stride * j)), b1 = norm(load(move + stride * (j + 1)));
-    const double closing = (a0 > a1 ? a0 : a1) + (b0 > b1 ? b0 : b1);
-    const double gap = norm(nearest_edges(x, i, j).off) - 2.0 * CORE * f.radius;
-    if (part * closing > ROOM * gap) part = ROOM * gap / closing;
+    if (f.pressure.data[p] >= 0.0)
+      part = safe_for(f, x, move, stride, f.pair.data[2 * p], f.pair.data[2 * p + 1], part);
   }
   return part > 0.0 ? part : 0.0;
 }
