@@ -183,6 +183,7 @@ def surround(
   view,
   look: int = 0,
   arrangement: Arrangement | None = None,
+  eye: str = "",
 ):
   """Puts a scene's only organ, which is at the world's origin, into an abdomen.
 
@@ -194,11 +195,13 @@ def surround(
     view: where the camera is and what it looks at [m]
     look: seed of spots and vessels
     arrangement: what is held aside, None for that of ARRANGEMENTS
+    eye: see `light`
   """
   cover(spec, organ, kind, look, uv)
   held = arrangement or ARRANGEMENTS[kind]
   furnish(spec, [name for name in NAMES if name != kind], kind, held, look)
-  light(spec, *view)
+  pos, target = view
+  light(spec, pos, target, eye)
 
 
 def enter(spec: mujoco.MjSpec, name: str, nodes: int, seed: int | None = None, look: int = 0):
@@ -362,8 +365,15 @@ def _fat(x: np.ndarray, y: np.ndarray) -> np.ndarray:
   return base + rise - clear + large(x, y) + small(x, y)
 
 
-def light(spec: mujoco.MjSpec, pos, target) -> None:
-  """Lights a scene as an endoscope does, and by nothing else: ever less with the distance."""
+def light(spec: mujoco.MjSpec, pos, target, eye: str = "") -> None:
+  """Lights a scene as an endoscope does, and by nothing else: ever less with the distance.
+
+  Args:
+    spec: changed in place
+    pos: of the lens [m]
+    target: what it is exposed for [m]
+    eye: body of the camera that the lamp goes with, empty for a camera that stands
+  """
   for lamp in list(spec.lights):
     spec.delete(lamp)
   head = spec.visual.headlight
@@ -373,9 +383,12 @@ def light(spec: mujoco.MjSpec, pos, target) -> None:
   beside = np.cross(forward, [0.0, 0.0, 1.0])
   beside *= 0.006 / np.linalg.norm(beside)
   near = min(1.0, np.polyval(_FADE[::-1], np.linalg.norm(forward)))  # exposed for what is near
-  spec.worldbody.add_light(
+  body, place = (spec.worldbody, np.asarray(pos) + beside)
+  if eye:
+    body, place, forward = spec.body(eye), np.array([0.006, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
+  body.add_light(
     name=LIGHT,
-    pos=np.asarray(pos) + beside,
+    pos=place,
     dir=forward,
     type=mujoco.mjtLightType.mjLIGHT_SPOT,
     cutoff=70,

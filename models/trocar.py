@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from palpate.tissue.reading import choices
 
-NAMES = ("probe", "grasper", "scissors", "hook", "scalpel")
+NAMES = ("probe", "grasper", "scissors", "hook", "scalpel", "laparoscope")
 JOINTS = ("pitch", "yaw", "insertion", "roll")
 DEPTH = 0.12  # from the trocar to the tip when every joint is zero [m]
 RANGES = ((-1.0472, 1.0472), (-1.0472, 1.0472), (-0.08, 0.13), (-3.1416, 3.1416))  # as JOINTS

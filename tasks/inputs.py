@@ -25,6 +25,8 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "grip": (),
   "held": (),
   "visible": (),
+  "centred": (),
+  "horizon": (),
   "freed": (),
   "traction": (),
   "deviation": (),

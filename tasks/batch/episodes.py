@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import mujoco as mj
 import numpy as np
-from palpate.models import trocar
+from palpate.models import laparoscope, trocar
 from palpate.tasks.core import randomisation
 from palpate.tasks.core.base import Task
 from palpate.tasks.core.engine import wrap
@@ -35,9 +35,13 @@ class Posed:
     """Returns where that puts the tip [m]  (3,)."""
     return trocar.forward(self.trocar(), self.pose[[0, 1, 3]])
 
+  def lens(self: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where that puts a laparoscope's lens [m], and its picture's axes in columns."""
+    return laparoscope.view(self.trocar(), (*self.pose, 0.0), self.optics)
+
 
 class Other(Posed, Second):
-  """The other hand's."""
+  """One beside it."""
 
 
 class Resting(Posed, Physics):
@@ -49,8 +53,11 @@ class Resting(Posed, Physics):
     """Takes a compiled scene, see `Physics.use`."""
     self._rest_normals: np.ndarray | None = None
     super().use(model, prefix, targets, organ, second)
-    self.second = Other(self, second) if second else None
     mj.mj_forward(self.model.ptr, self.data.ptr)  # the camera is where it is
+
+  def beside(self, prefix: str) -> Second:
+    """Returns another instrument of the scene."""
+    return Other(self, prefix)
 
   def mark(self, *args: Any, **kwargs: Any) -> None:
     """Does nothing: no picture is made."""
@@ -135,12 +142,12 @@ class Episodes:
 
   def _row(self) -> Mapping[str, Any]:
     model, frame = self.physics.model.ptr, dict[str, Any]()
-    for hand in self.physics.hands:
+    for which, hand in of_physics(self.physics).items():
       body = model.body(f"{hand.prefix}trocar")
       if body.parentid[0]:
         raise ValueError(f"{self._task.name}: the trocar hangs on a body, expected the world")
       own = body.pos.copy(), body.quat.copy(), hand.pose
-      frame |= dict(zip(of_hand(hand is not self.physics), own, strict=True))
+      frame |= dict(zip(rows_of(which), own, strict=True))
     if self.look and self._task.ranges:
       frame["look_film"] = np.array(randomisation.film(self._task.drawn))
       frame |= {f"look_{k}": v for k, v in self.look(model).items()}
@@ -151,9 +158,15 @@ class Episodes:
     return frame | dict(self._draw_own(self._task)) | dict(self._task.tissue())
 
 
-def of_hand(other: bool) -> list[str]:
-  """Returns the names of the rows of HAND of the instrument, or of the other hand's."""
-  return [f"other_{name}" for name in HAND] if other else [*HAND]
+def of_physics(physics: Any) -> dict[str, Any]:
+  """Returns the instruments of a scene by what the names of their rows begin with."""
+  all_of = {"": physics, "other_": physics.second, "guided_": physics.guided}
+  return {which: hand for which, hand in all_of.items() if hand}
+
+
+def rows_of(which: str) -> list[str]:
+  """Returns the names of the rows of HAND of one of the instruments of `of_physics`."""
+  return [which + name for name in HAND]
 
 
 def at_rest(model: mj.MjModel, state: np.ndarray, kind: int) -> mj.MjData:

@@ -29,11 +29,14 @@ class Common:
   depth: float  # from the trocar to the tip when every joint is zero [m]
   first: int  # its first component of an action
   jaw: int  # actuator, -1 without jaws
+  fifth: int  # actuator of jaws or of a camera's head, -1 without
+  head: int  # joint of a camera's head in qpos, -1 without
+  optics: float  # angle between shaft and view of a laparoscope [rad]
   opening: int  # first of the two joints of the jaws in qpos
   qposadr: ints(4)  # of pitch, yaw, roll, insertion
   dofadr: ints(4)
   drive: ints(4)  # actuators
-  low: floats(5)  # of the controls, jaw last
+  low: floats(5)  # of the controls, the fifth last
   high: floats(5)
   move: floats(4)  # what an action of 1 adds to the drives' targets [rad, m]
   sensoradr: ints(4)  # of tip and shaft force, force on the left and right jaw
@@ -72,6 +75,9 @@ class Common:
   other_tip_pos: floats("nworld", 3)
   other_tip_quat: floats("nworld", 4)
   other_tissue_force: floats("nworld", 3)
+  # Of an instrument that the exercise itself moves.
+  guided_tip_pos: floats("nworld", 3)
+  guided_drive: ints(4)
   # Drawn for an episode.
   body_pos: floats("nworld", 3)  # of the trocar in the world [m]
   body_quat: floats("nworld", 4)  # w x y z
@@ -114,6 +120,7 @@ class Common:
   shaft_force: floats("nworld", 3)
   peak_force: floats("nworld", 1)
   gripper: floats("nworld", 4)
+  camera_head: floats("nworld", 1)
   nodes_near: floats("nworld", NEAR, 3)
   surface: floats("nworld", COARSE, 3)
   progress: floats("nworld", 1)

@@ -80,9 +80,9 @@ def act(s: Common):
   for k in range(4):
     target = s.ctrl[w, s.drive[k]] + wp.clamp(s.action[w, s.first + k], -1.0, 1.0) * s.move[k]
     s.ctrl[w, s.drive[k]] = wp.clamp(target, s.low[k], s.high[k])
-  if s.jaw >= 0:
+  if s.fifth >= 0:
     share = 0.5 * (wp.clamp(s.action[w, s.first + 4], -1.0, 1.0) + 1.0)
-    s.ctrl[w, s.jaw] = s.low[4] + (s.high[4] - s.low[4]) * share
+    s.ctrl[w, s.fifth] = s.low[4] + (s.high[4] - s.low[4]) * share
 
 
 @wp.kernel(enable_backward=False)
@@ -93,8 +93,8 @@ def begin(s: Common):
     return
   for k in range(4):
     s.ctrl[w, s.drive[k]] = s.pose[w, k]
-  if s.jaw >= 0:
-    s.ctrl[w, s.jaw] = 0.0
+  if s.fifth >= 0:
+    s.ctrl[w, s.fifth] = 0.0
   s.step[w] = 0
   s.failed[w] = s.failures[w]
   s.outcome[w] = RUNNING
@@ -143,6 +143,8 @@ def measure(s: Common, beginning: bool):
     s.joint_vel[w, k] = s.qvel[w, s.dofadr[k]]
     s.drive_error[w, k] = s.ctrl[w, s.drive[k]] - s.joints[w, k]
   place(s, w)
+  if s.head >= 0:
+    s.camera_head[w, 0] = s.qpos[w, s.head]
   felt = wp.float32(0.0)
   most = wp.vec3()
   for k in range(3):

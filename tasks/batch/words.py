@@ -25,7 +25,8 @@ _POINT = wp.constant(1e-12)  # square of a strand's length that is none, for rou
 
 WORDS: dict[Any, Any] = {  # of Python -> of Warp
   rules.rows: wp.matrix_from_rows, rules.vector: wp.vec3, rules.length: wp.length,
-  rules.dot: wp.dot, rules.root: wp.sqrt, rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
+  rules.dot: wp.dot, rules.root: wp.sqrt, rules.angle: wp.atan2, rules.sine: wp.sin,
+  rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
 }  # fmt: skip
 
 
@@ -93,6 +94,36 @@ def other_point(s: Common, place: wp.vec3):
 def other_force(s: Common):
   """See `rules`."""
   return wp.length(kernels.vector(s.other_tissue_force, s.world))
+
+
+@word
+def lens(s: Common):
+  """See `rules`."""
+  return tip(s)
+
+
+@word
+def picture(s: Common):
+  """See `rules`."""
+  half = -0.5 * s.optics
+  turn = _turn(s.tip_quat, s.world) * wp.quat(wp.sin(half), 0.0, 0.0, wp.cos(half))
+  half = 0.5 * s.camera_head[s.world, 0]
+  turn = turn * wp.quat(0.0, 0.0, wp.sin(half), wp.cos(half))
+  return wp.transpose(wp.quat_to_matrix(turn))
+
+
+@word
+def guided_tip(s: Common):
+  """See `rules`."""
+  return kernels.vector(s.guided_tip_pos, s.world)
+
+
+@word
+def guide(s: Common, joints: wp.vec3):
+  """See `rules`."""
+  s.ctrl[s.world, s.guided_drive[0]] = joints[0]
+  s.ctrl[s.world, s.guided_drive[1]] = joints[1]
+  s.ctrl[s.world, s.guided_drive[3]] = joints[2]
 
 
 @word

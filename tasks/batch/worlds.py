@@ -16,12 +16,13 @@ from palpate.batch.threads import Threads
 from palpate.models import trocar
 from palpate.tasks.core import episode, jaws
 from palpate.tasks.core.environment import Environment
-from palpate.tasks.core.instrument import AROUND, AXES, FORCES, JAWS, RATES, TOUCH
+from palpate.tasks.core.instrument import AROUND, AXES, FIFTH, FORCES, JAWS, RATES, TOUCH
+from palpate.tasks.core.scenes import GUIDED
 from palpate.tasks.core.stage import STATE
 from palpate.tissue.types import allocate
 
 from . import kernels, tally
-from .episodes import FRAME, HAND, Episodes, at_rest, of_hand
+from .episodes import FRAME, HAND, Episodes, at_rest, of_physics, rows_of
 from .fields import OBSERVED, Common
 from .pictures import Pictures
 from .states import States
@@ -33,6 +34,7 @@ class Worlds:
   Attributes:
     fields: what every exercise has, arrays on the device
     other: the same of the other hand's instrument, or None
+    guided: the same of one that the exercise itself moves, or None
     states: of the exercise's rules
     tally: what metrics are made of
     batch: the physics
@@ -74,7 +76,7 @@ class Worlds:
     self.organ, self._tissue = self.batch.organ(task.organ), tuple(task.tissue())
     dt = environment.control_timestep()
     self._steps = self.batch.watch(self._substeps)
-    self.fields, self.other = self._make(task, task.prefix, dt, limit), None
+    self.fields, self.other, self.guided = self._make(task, task.prefix, dt, limit), None, None
     if task.second:
       self.other = self._make(task, task.second, dt, limit)
       self.other.first = len(task.components) - len(AXES) - len(task.other)
@@ -82,6 +84,10 @@ class Worlds:
         setattr(self.other, name, getattr(self.fields, name))
       for name in ("tip_pos", "tip_quat", "tissue_force"):
         setattr(self.fields, f"other_{name}", getattr(self.other, name))
+    if self.episodes.physics.guided:
+      self.guided = self._make(task, GUIDED, dt, limit)
+      self.guided.begun = self.fields.begun
+      self.fields.guided_tip_pos, self.fields.guided_drive = self.guided.tip_pos, self.guided.drive
     if self.fields.cutter_inside.shape[1]:
       self.batch.feel(f"{task.prefix}tip_force", task.organ)
     self.tally = self._count(task)
@@ -104,8 +110,14 @@ class Worlds:
 
   @property
   def hands(self) -> tuple[Any, ...]:
-    """The fields of each instrument."""
+    """The fields of each hand's instrument."""
     return (self.fields, self.other) if self.other else (self.fields,)
+
+  @property
+  def instruments(self) -> dict[str, Any]:
+    """The fields of each instrument, by what the names of its rows begin with."""
+    all_of = {"": self.fields, "other_": self.other, "guided_": self.guided}
+    return {which: s for which, s in all_of.items() if s}
 
   def _make(self, task: Any, prefix: str, dt: float, limit: int) -> Any:
     physics, model = self.episodes.physics, self.batch.model
@@ -119,10 +131,10 @@ class Worlds:
     s = allocate(Common, self.device, sizes)
     s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
     s.force_limit, s.damage = task.force_limit, task.damage
-    s.depth = trocar.trocar(model, prefix).depth
+    s.depth, s.optics = trocar.trocar(model, prefix).depth, physics.optics
     self._point_at(s, prefix, model)
     drives = [model.actuator(prefix + axis).id for axis in AXES]
-    controls = model.actuator_ctrlrange[[*drives, s.jaw if s.jaw >= 0 else drives[0]]]
+    controls = model.actuator_ctrlrange[[*drives, s.fifth if s.fifth >= 0 else drives[0]]]
     coarse = physics.coarse
     constants = {
       "drive": drives, "low": controls[:, 0], "high": controls[:, 1],
@@ -159,6 +171,9 @@ class Worlds:
     s.qposadr.assign(np.array([int(joint.qposadr[0]) for joint in joints]))
     s.dofadr.assign(np.array([int(joint.dofadr[0]) for joint in joints]))
     s.jaw = model.actuator(f"{prefix}jaw").id if jaws else -1
+    found = [mj.mj_name2id(model, mj.mjtObj.mjOBJ_ACTUATOR, prefix + name) for name in FIFTH]
+    s.fifth, head = max(found), mj.mj_name2id(model, mj.mjtObj.mjOBJ_JOINT, f"{prefix}head")
+    s.head = int(model.jnt_qposadr[head]) if head >= 0 else -1
     s.opening = int(model.joint(f"{prefix}jaw_left").qposadr[0]) if jaws else -1
     sensors = [model.sensor(prefix + n).id for n in (*FORCES, *(TOUCH if jaws else ()))]
     s.sensoradr.assign(model.sensor_adr[sensors + [0] * (4 - len(sensors))])
@@ -238,7 +253,8 @@ class Worlds:
   def launch_step(self, action: wp.array) -> None:
     """Begins a control step with actions that are allowed."""
     wp.copy(self.fields.action, action)
-    self._of_hands(kernels.act)
+    for hand in self.hands:
+      self.launch(kernels.act, self.nworld, [hand])
     if self.states.act:
       self._act()
     self.batch.step(self._substeps)
@@ -296,17 +312,12 @@ class Worlds:
 
   def _measure(self, beginning: bool) -> None:
     """Measures the instruments, and brings what is of the batch up to date."""
-    for hand in self.hands:
+    for hand in self.instruments.values():
       self._read(hand)
+      self.launch(kernels.measure, self.nworld, [hand, beginning])
     self._read_organ()
-    self._of_hands(kernels.measure, beginning)
     if self.other:
       self._over(kernels.join, self.other)
-
-  def _of_hands(self, kernel: Any, *inputs: Any) -> None:
-    """Launches a kernel over the fields of each instrument."""
-    for hand in self.hands:
-      self.launch(kernel, self.nworld, [hand, *inputs])
 
   def begin(self, worlds: np.ndarray, seeds: Sequence[int | None] | None = None) -> None:
     """Begins episodes in some worlds, numbers or a mask."""
@@ -320,19 +331,21 @@ class Worlds:
     at = wp.array(worlds, dtype=int, device=self.device)
     for name in FRAME:
       self._write(getattr(s, name), at, rows[name][worlds])
-    for name, row in zip(HAND, of_hand(True), strict=True) if self.other else ():
-      self._write(getattr(self.other, name), at, rows[row][worlds])
+    for which, hand in self.instruments.items():
+      for name, row in zip(HAND, rows_of(which), strict=True) if which else ():
+        self._write(getattr(hand, name), at, rows[row][worlds])
     self._write_states(at, rows, worlds)
     self.batch.reset(s.begun)
-    for hand, prefix in zip(self.hands, (self.task.prefix, self.task.second), strict=False):
+    names = [hand.prefix for hand in of_physics(self.episodes.physics).values()]
+    for (which, hand), of in zip(self.instruments.items(), names, strict=True):
       # The plugin's worlds take them as they were drawn, in float64.
       pos, quat, pose = (
         rows[row] if self.device.is_cpu else getattr(hand, name)
-        for name, row in zip(HAND, of_hand(hand is not s), strict=True)
+        for name, row in zip(HAND, rows_of(which), strict=True)
       )  # fmt: skip
       if self.task.jitter:
-        self.batch.place(f"{prefix}trocar", pos, quat, s.begun)
-      self.batch.pose([prefix + axis for axis in AXES], pose, s.begun)
+        self.batch.place(f"{of}trocar", pos, quat, s.begun)
+      self.batch.pose([of + axis for axis in AXES], pose, s.begun)
     if self._tissue:
       self.organ.configure(mask, **{key: rows[key] for key in self._tissue})
     self.run(self._open)
@@ -352,7 +365,8 @@ class Worlds:
 
   def _open(self) -> None:
     """Launches what follows the beginning of episodes."""
-    self._of_hands(kernels.begin)
+    for hand in self.instruments.values():
+      self.launch(kernels.begin, self.nworld, [hand])
     self._measure(True)
     self._over(tally.start, self.tally)
     if self.other:

@@ -13,6 +13,7 @@ position drives by the action times the rate:
 | 3 `insertion` | depth, positive is deeper | 0.12 m/s |
 | 4 `jaw` (grasper) | opening of the jaws, not a rate: -1 squeezes closed jaws, 1 is wide open | |
 | 4 `report` (palpation) | above 0.5: the inclusion is here | |
+| 4 `head` (laparoscope) | turn of the camera against the scope, not a rate: 1 is half a turn | |
 
 With `input="handle"` the action says where the hand holds the instrument, in place of the first
 four, see `handle`; a spring and a damper pull the tip there, and the hand feels them.
@@ -53,7 +54,7 @@ from ..recording import Event, Settings
 from . import engine, observation, randomisation, safety, scenes, stage
 from .environment import CONTROL_TIMESTEP
 from .handle import ROW
-from .instrument import AXES, JAWS
+from .instrument import AXES, JAWS, SCOPE
 from .physics import Physics, check_scene
 from .randomisation import Ranges
 from .rules import DAMAGED, HIDDEN, NOW, OUTCOMES, SUCCESS
@@ -96,6 +97,7 @@ class Task(engine.Task):
   outcome: str | None = None
   events: list[Event]
   targets = 1
+  away = (0.03, 0.045)  # from the place of work to the tip, where an episode begins [m]
 
   def __init__(
     self,
@@ -178,7 +180,7 @@ class Task(engine.Task):
   @property
   def extra(self) -> tuple[str, ...]:
     """Names of those that do not move the instrument as a whole."""
-    return ("jaw",) if self.jaws else ()
+    return ("jaw",) if self.jaws else ("head",) if self.prefix == SCOPE else ()
 
   @property
   def other(self) -> tuple[str, ...]:
@@ -330,7 +332,7 @@ class Task(engine.Task):
       port = hand.trocar()
       away = (port.pos - center) / np.linalg.norm(port.pos - center)
       aside = self.random.uniform(-0.015, 0.015, 3)
-      tip = center + (self.random.uniform(0.03, 0.045) + back) * away + aside
+      tip = center + (self.random.uniform(*self.away) + back) * away + aside
       joints = trocar.inverse(port, tip)
       pose = np.array([joints[0], joints[1], self.random.uniform(-0.5, 0.5), joints[2]])
       hand.set_joints(pose)

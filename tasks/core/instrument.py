@@ -2,11 +2,12 @@
 # pyright: reportAttributeAccessIssue=false
 """An instrument on a trocar: where it is, what moves it and what it feels."""
 
+import math
 from typing import Any
 
 import mujoco as mj
 import numpy as np
-from palpate.models import situs, trocar
+from palpate.models import laparoscope, situs, trocar
 from palpate.models.handle import Handle, find, pose
 
 from .handle import ROW, Guide
@@ -14,6 +15,8 @@ from .jaws import Jaws
 
 AXES = ("pitch", "yaw", "roll", "insertion")
 JAWS = "grasper/"  # prefix of the instrument that has them
+SCOPE = f"{laparoscope.NAME}/"  # prefix of the one that carries the camera
+FIFTH = ("jaw", "head")  # what a fifth component of an action drives
 TOUCH = ("touch_left", "touch_right")  # sensors of the jaws
 FORCES = ("tip_force", "shaft_force")  # sensors of what an instrument exerts
 AROUND = tuple(f"{situs.SURROUNDINGS}_{part}" for part in ("tip", "shaft"))  # and of that around
@@ -35,6 +38,9 @@ class Instrument:
     data: its state
     handle: that pulls it, None where position drives move it
     guide: takes the handle along an action
+    jaw: actuator of its jaws, -1 without
+    fifth: actuator of jaws or of a camera's head, -1 without
+    optics: angle between a laparoscope's shaft and its view [rad]
     peak_force: largest force since the last control step, or a jaw's mean if that is more [N]
     peak_tissue: the same of tissue alone [N]
     peak_shaft: largest force of tissue on the shaft since then [N]
@@ -46,6 +52,7 @@ class Instrument:
   model: Any
   data: Any
   handle: Handle | None = None
+  optics = 0.0
 
   def equip(self, prefix: str) -> None:
     """Finds an instrument in the model."""
@@ -64,13 +71,19 @@ class Instrument:
     driven = () if self.handle else AXES
     self.drives = np.array([model.actuator(prefix + axis).id for axis in driven], int)
     self.drive_range = model.actuator_ctrlrange[self.drives].copy()
-    self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
+    fifth = [model.actuator(prefix + name).id for name in FIFTH if name in self._sensors]
+    self.fifth = fifth[0] if fifth else -1
+    self.jaw = self.fifth if self.has_jaw else -1
     self._jaws = Jaws(model, prefix) if self.has_jaw else None
     self._inner = np.zeros(2)
     self._forced = [n for n in (*FORCES, *AROUND) if n in self._sensors]
     signals = [*self._forced, *(TOUCH if self.has_jaw else ())]
     self._signals = np.concatenate([np.arange(*self._sensors[n].indices(10**6)) for n in signals])
     self._trocar = trocar.trocar(model, prefix)
+    if prefix == SCOPE:
+      self._lens = model.camera(laparoscope.NAME).id
+      w, x, _, _ = model.body(f"{prefix}eye").quat
+      self.optics = -2 * math.atan2(x, w)
 
   @property
   def has_jaw(self) -> bool:
@@ -157,6 +170,18 @@ class Instrument:
     mj.mju_rotVecQuat(offset, point, self.tip_quat())
     return self.tip_pos() + offset
 
+  def head(self) -> np.ndarray:
+    """Returns how far a laparoscope's camera is turned against it [rad]  (1,)."""
+    return self.sensor("head")
+
+  def lens(self) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where a laparoscope's lens is [m], and the picture's axes right, up, back in columns.
+
+    Shapes (3,) and (3, 3).
+    """
+    data = self.data.ptr
+    return data.cam_xpos[self._lens].copy(), data.cam_xmat[self._lens].reshape(3, 3).copy()
+
   def trocar(self) -> trocar.Trocar:
     """Returns the instrument's trocar."""
     return self._trocar
@@ -179,13 +204,13 @@ class Instrument:
     low, high = self.drive_range.T
     ctrl = self.data.ptr.ctrl
     ctrl[self.drives] = (ctrl[self.drives] + values[:4] * _RATES * dt).clip(low, high)
-    if self.jaw >= 0:
-      self.close_jaws(values[4])
+    if self.fifth >= 0:
+      self.drive_fifth(values[4])
 
-  def close_jaws(self, share: float) -> None:
-    """Gives the jaws their target: 1 is wide open, -1 squeezes closed jaws."""
-    low, high = self.model.ptr.actuator_ctrlrange[self.jaw]
-    self.data.ptr.ctrl[self.jaw] = low + (high - low) * (share + 1) / 2
+  def drive_fifth(self, share: float) -> None:
+    """Gives jaws their target, 1 is wide open, -1 squeezes closed jaws; or a camera's head."""
+    low, high = self.model.ptr.actuator_ctrlrange[self.fifth]
+    self.data.ptr.ctrl[self.fifth] = low + (high - low) * (share + 1) / 2
 
   def set_joints(self, joints: np.ndarray) -> None:
     """Puts the instrument and its drives at a pose, as `joints`, with closed jaws."""
@@ -196,8 +221,8 @@ class Instrument:
       self.guide.put(row)
     else:
       self.data.ctrl[self.drives] = joints
-    if self.jaw >= 0:
-      self.data.ctrl[self.jaw] = 0.0
+    if self.fifth >= 0:
+      self.data.ctrl[self.fifth] = 0.0
     self._inner = np.zeros(2)
     mj.mj_forward(self.model.ptr, self.data.ptr)
 
@@ -233,8 +258,8 @@ class Instrument:
     row, vel, spin = self.guide.advance(k, nstep, dt)
     assert self.handle is not None
     self.handle.move(row[:3], row[3:7], vel, spin)
-    if self.jaw >= 0 and len(row) > len(ROW):
-      self.close_jaws(row[len(ROW)])
+    if self.fifth >= 0 and len(row) > len(ROW):
+      self.drive_fifth(row[len(ROW)])
 
   def keep(self, sensors: np.ndarray) -> None:
     """Keeps the forces of steps that had these sensor values  (nstep, nsensordata)."""

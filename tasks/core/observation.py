@@ -19,7 +19,7 @@ from dm_env import specs
 
 from . import randomisation
 from .engine import Camera
-from .instrument import JAWS
+from .instrument import JAWS, SCOPE
 from .physics import COARSE, NEAR, Physics
 from .scenes import CAMERA
 
@@ -39,7 +39,7 @@ class Row:
     unit: of its numbers
     what: it is
     measure: takes task and physics, or the other hand's instrument for a sensor, returns it
-    jaws: whether instruments with jaws alone have it
+    only: prefix of the instrument that alone has it, empty for all
   """
 
   group: str
@@ -47,7 +47,7 @@ class Row:
   unit: str
   what: str
   measure: Callable[[Any, Physics], np.ndarray]
-  jaws: bool = False
+  only: str = ""
 
 
 ROWS = {
@@ -86,7 +86,15 @@ ROWS = {
     "rad, rad, N, N",
     "opening of the jaws, its target, force on the left and right jaw",
     lambda t, p: p.gripper(),
-    jaws=True,
+    only=JAWS,
+  ),
+  "camera_head": Row(
+    "sensors",
+    (1,),
+    "rad",
+    "how far the camera is turned against the laparoscope",
+    lambda t, p: p.head(),
+    only=SCOPE,
   ),
   "nodes_near": Row(
     "state",
@@ -306,9 +314,9 @@ def _numbers(task: Any, physics: Physics) -> collections.OrderedDict:
 
 def _rows(first: str, second: str) -> list[tuple[str, Row, int]]:
   """Returns names, rows and hands of instruments with these prefixes; the second's is sensors."""
-  out = [(name, row, 0) for name, row in ROWS.items() if first == JAWS or not row.jaws]
+  out = [(name, row, 0) for name, row in ROWS.items() if row.only in ("", first)]
   for name, row in ROWS.items() if second else ():
-    if row.group == "sensors" and (second == JAWS or not row.jaws):
+    if row.group == "sensors" and row.only in ("", second):
       out.append((f"{second.rstrip('/')}_{name}", row, 1))
   return out
 
@@ -344,7 +352,7 @@ def table() -> str:
   """Returns what every exercise has as a Markdown table."""
   lines = ["| name | group | shape | type | unit | what |", "|---|---|---|---|---|---|"]
   for name, row in ROWS.items():
-    what = f"{row.what}; with jaws only" if row.jaws else row.what
+    what = f"{row.what}; {row.only[:-1]} only" if row.only else row.what
     cells = f"`{row.group}` | {_text(*row.shape)} | float64 | {row.unit} | {what}"
     lines.append(f"| `{name}` | {cells} |")
   for name, p in PICTURES.items():

@@ -18,7 +18,7 @@ from ..metrics.samples import Stretch
 from . import scenes
 from .engine import wrap
 from .instrument import AXES, JAWS, Instrument, Second
-from .scenes import CAMERA, ORGAN
+from .scenes import CAMERA, GUIDED, ORGAN
 from .stage import STATE
 
 NEAR, COARSE = 8, 32  # nodes in the observations
@@ -34,11 +34,13 @@ class Physics(Instrument, Portable):
 
   Attributes:
     second: the instrument of the other hand, None where there is none
+    guided: an instrument that the exercise itself moves, in nobody's hand; None for none
     meanwhile: called in the middle of every `step`, with what need not be done at its end, where a
       live exercise has least time; None for nothing
   """
 
   second: Second | None = None
+  guided: Second | None = None
   meanwhile: Callable[[], None] | None = None
 
   def use(
@@ -71,8 +73,14 @@ class Physics(Instrument, Portable):
     self._stretch: tuple[np.ndarray, np.ndarray, Stretch] | None = None
     self._cuts = bool(self.organ.config.cutters)
     self.equip(prefix)
-    self.second = Second(self, second) if second else None
+    self.second = self.beside(second) if second else None
+    moved = mj.mj_name2id(model, mj.mjtObj.mjOBJ_BODY, f"{GUIDED}trocar") >= 0
+    self.guided = self.beside(GUIDED) if moved else None
     self.quiet()
+
+  def beside(self, prefix: str) -> Second:
+    """Returns another instrument of the scene."""
+    return Second(self, prefix)
 
   @property
   def hands(self) -> tuple[Instrument, ...]:
@@ -114,8 +122,8 @@ class Physics(Instrument, Portable):
   def resume(self, data: mj.MjData, rest: dict[str, Any], config: Config) -> None:
     """See `Portable`."""
     super().resume(data, rest, config)
-    if self.second:
-      self.second.bind(self)
+    for other in filter(None, (self.second, self.guided)):
+      other.bind(self)
 
   def quiet(self) -> None:
     """See `Instrument`; of all."""

@@ -139,6 +139,16 @@ def vector(x: float, y: float, z: float) -> np.ndarray:
   return np.array([x, y, z])
 
 
+def angle(y: float, x: float) -> float:
+  """Returns the angle of a vector (x, y) against the first axis [rad]."""
+  return math.atan2(y, x)
+
+
+def sine(x: float) -> float:
+  """Returns the sine of an angle [rad]."""
+  return math.sin(x)
+
+
 def length(v: np.ndarray) -> float:
   """Returns the length of a vector."""
   return math.sqrt(v.dot(v))
@@ -225,6 +235,26 @@ def other_point(s: Any, place: np.ndarray) -> np.ndarray:
 def other_force(s: Any) -> float:
   """Returns the force of tissue on that instrument below the shaft [N]."""
   return length(s.second.tissue_force())
+
+
+def lens(s: Any) -> np.ndarray:
+  """Returns where the lens of the laparoscope is that one holds [m]."""
+  return s.lens()[0]
+
+
+def picture(s: Any) -> np.ndarray:
+  """Returns the axes of its picture, right, up and back, see `Vectors3`."""
+  return s.lens()[1].T
+
+
+def guided_tip(s: Any) -> np.ndarray:
+  """Returns where the tip of the instrument is that the exercise moves [m]."""
+  return s.guided.tip_pos()
+
+
+def guide(s: Any, joints: np.ndarray) -> None:
+  """Tells its drives pitch, yaw [rad] and insertion [m]."""
+  s.data.ctrl[s.guided.drives[[0, 1, 3]]] = joints
 
 
 def bonds(s: Any) -> int:

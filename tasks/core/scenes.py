@@ -17,7 +17,7 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 import palpate
-from palpate.models import catalog, mjcf, scenery, shapes, situs, trocar
+from palpate.models import catalog, laparoscope, mjcf, scenery, shapes, situs, trocar
 from palpate.models.catalog import Tissue
 from palpate.tissue.geometry.mesh import vertex_normals
 
@@ -26,6 +26,7 @@ FILM, RAW = (0.9, 0.74, 0.55, 0.9), (0.32, 0.05, 0.04, 1.0)  # colours of bonds 
 ORGAN = "organ"
 BED = "bed"  # patch of the gallbladder, and the body that is in the liver's place
 CAMERA = "laparoscope"
+GUIDED = "guided/"  # prefix of an instrument that the exercise itself moves
 LIGHT = situs.LIGHT
 INPUTS = ("drives", "handle")
 SURROUNDINGS = ("abdomen", "unseen", "none")
@@ -40,9 +41,9 @@ CONTACT = {
 # Residual of the organ's solve; 1e-4, the plugin's own, changes contact forces by 0.1 %.
 TOLERANCE = 1e-2
 # Slots of the organ's window for each 1000 nodes; the experts' instruments touch 15 and 38 at most.
-_SLOTS = {"probe": 40, "grasper": 48, "scalpel": 40, "hook": 24}
+_SLOTS = {"probe": 40, "grasper": 48, "scalpel": 40, "hook": 24, "laparoscope": 40}
 # More than MuJoCo's 1 makes friction creep less: 2.4 N of grip then hold 3 N, with 3 only 2 N.
-_IMPRATIO = {"probe": 3, "grasper": 10, "scalpel": 3}
+_IMPRATIO = {"probe": 3, "grasper": 10, "scalpel": 3, "laparoscope": 3}
 # Foundation of an organ that comes away from its bed [Pa/m]; ours: what lies around it lets go too.
 _LOOSE = 3e3
 _FILM = (0.0045, 0.0045, 0.0012)  # of the film where a bond is, and of the raw bed [m]
@@ -62,7 +63,7 @@ class Scene:
 
   Attributes:
     organ: one of `TISSUES`
-    instrument: `probe`, `grasper` or `scalpel`
+    instrument: `probe`, `grasper`, `scalpel` or the `laparoscope`, which then has the camera
     nodes: number of the organ's nodes
     variant: seed of the organ's shape, None for the mean shape
     center: the organ's landmark that ports and camera look at
@@ -70,6 +71,9 @@ class Scene:
     camera: from there to the camera [m]  (3,)
     second: instrument of the other hand, "" for none
     second_port: from the landmark to its trocar [m]  (3,)
+    optics: angle between the laparoscope's shaft and its view, where it is the instrument [rad]
+    guided: instrument that the exercise itself moves and that meets nothing, "" for none
+    guided_port: from the landmark to its trocar [m]  (3,)
     targets: number of target sites
     inclusion: hidden stiff place: position in the world [m] (3), radius [m], factor on Young's
       modulus; None for healthy tissue. Without gravity: the organ would sag less where it is stiff
@@ -89,6 +93,9 @@ class Scene:
   camera: tuple[float, float, float] = (-0.05, 0.15, 0.12)
   second: str = ""
   second_port: tuple[float, float, float] = (-0.05, 0.0, 0.12)
+  optics: float = laparoscope.OPTICS
+  guided: str = ""
+  guided_port: tuple[float, float, float] = (0.06, 0.05, 0.12)
   targets: int = 1
   inclusion: tuple[float, ...] | None = None
   handle: bool = False
@@ -207,7 +214,8 @@ def build(scene: Scene) -> mujoco.MjSpec:
   if scene.surroundings == "abdomen":
     uv = scenery.texcoord(scene.organ, vertices @ _TURN, triangles)
     view = center + scene.camera, center
-    situs.surround(spec, ORGAN, scene.organ, uv, view, arrangement=held)
+    eye = f"{laparoscope.NAME}/eye" if scene.instrument == laparoscope.NAME else ""
+    situs.surround(spec, ORGAN, scene.organ, uv, view, arrangement=held, eye=eye)
     flat, outward = mujoco.mjtGeom.mjGEOM_ELLIPSOID, vertex_normals(vertices, triangles)
     for node in bed(*shape) if scene.bonds else ():
       turn = trocar.aim(np.zeros(3), outward[node])
@@ -216,7 +224,18 @@ def build(scene: Scene) -> mujoco.MjSpec:
       )
   if scene.surroundings != "none":
     situs.obstruct(spec, [n for n in situs.NAMES if n != scene.organ], scene.organ, held)
+  if scene.guided:
+    _guide(spec, scene, center)
   return spec
+
+
+def _guide(spec: mujoco.MjSpec, scene: Scene, center: np.ndarray) -> None:
+  """Adds the instrument that the exercise itself moves."""
+  port = center + scene.guided_port
+  trocar.attach(spec, scene.guided, GUIDED, port, trocar.aim(port, center))
+  for geom in spec.geoms:
+    if geom.parent.name.startswith(GUIDED):
+      geom.contype = geom.conaffinity = 0
 
 
 def furnish(
@@ -234,7 +253,9 @@ def furnish(
   spec = mujoco.MjSpec.from_string(_xml(organ, center, scene, bed))
   for name, offset in ((scene.instrument, scene.port), (scene.second, scene.second_port)):
     port = center + offset
-    if name:
+    if name == laparoscope.NAME:
+      _look(spec, scene, center)
+    elif name:
       trocar.attach(spec, name, f"{name}/", port, trocar.aim(port, center), scene.handle)
   touched = sum(_SLOTS[name] for name in (scene.instrument, scene.second) if name)
   slots = slots or touched * max(1, -(-scene.nodes // 1000))
@@ -242,14 +263,32 @@ def furnish(
   return spec
 
 
+def _look(spec: mujoco.MjSpec, scene: Scene, center: np.ndarray) -> None:
+  """Puts the camera on a laparoscope, whose picture is level where its joints are zero."""
+  prefix = f"{laparoscope.NAME}/"
+  back = np.asarray(scene.port) / np.linalg.norm(scene.port)
+  quat = laparoscope.orientation(np.column_stack([*_upright(back), back]))
+  trocar.attach(spec, laparoscope.NAME, prefix, center + scene.port, quat, scene.handle)
+  spec.body(f"{prefix}eye").quat = laparoscope.turned(scene.optics)
+  spec.camera(f"{prefix}camera").name = CAMERA
+
+
+def _upright(back: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns right and up of a level picture from its direction back to the camera."""
+  right = np.cross([0.0, 0.0, 1.0], back)
+  right /= np.linalg.norm(right)
+  return right, np.cross(back, right)
+
+
 def _xml(flex: str, center: np.ndarray, scene: Scene, bed: str) -> str:
   def numbers(values) -> str:
     return mjcf.numbers(values, digits=7)
 
   camera = center + scene.camera
-  back = -np.asarray(scene.camera) / np.linalg.norm(scene.camera)
-  right = np.cross(back, [0.0, 0.0, 1.0])
-  right /= np.linalg.norm(right)
+  back = np.asarray(scene.camera) / np.linalg.norm(scene.camera)
+  axes = numbers(np.concatenate(_upright(back)))
+  fixed = scene.instrument != laparoscope.NAME
+  lens = f'<camera name="{CAMERA}" pos="{numbers(camera)}" fovy="50" xyaxes="{axes}"/>' * fixed
   sites = "".join(
     f'<site name="target{i}" size="0.003" rgba="0.2 0.75 0.95 0.9"/>' for i in range(scene.targets)
   )
@@ -270,10 +309,9 @@ def _xml(flex: str, center: np.ndarray, scene: Scene, bed: str) -> str:
       width="64" height="64"/>
   </asset>
   <worldbody>
-    <light pos="{numbers(camera + np.array([0, 0, 0.05]))}" dir="{numbers(back)}"
+    <light pos="{numbers(camera + np.array([0, 0, 0.05]))}" dir="{numbers(-back)}"
       castshadow="false"/>
-    <camera name="{CAMERA}" pos="{numbers(camera)}" fovy="50"
-      xyaxes="{numbers(right)} {numbers(np.cross(right, back))}"/>
+    {lens}
     {sites}
     <body name="{BED}">{bed}</body>
     {flex}

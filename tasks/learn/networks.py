@@ -29,7 +29,7 @@ from .sight import PICTURES, Seeing
 
 HIDDEN = ("joint_vel", "drive", "tip_vel", "surface")  # from an actor that is taught
 ACTING, MORE = "acting", "more"  # groups of observations
-CHANGES = ("jaw",)  # components that an actor says as changes: jaws close by and by
+CHANGES = ("jaw", "head")  # components that an actor says as changes: jaws close by and by
 POWER = 2.0  # an action is what the actor says times its size: slow motion is as clear as fast
 CLONING = 700  # steps of the optimiser of a round
 _BATCH, _RATE = 32, 3e-3  # lessons of a step

@@ -336,3 +336,29 @@ def out_of_view(time: ArrayLike, visible: ArrayLike) -> float:
   time = check_time(time)
   seen = same("visible", rows("visible", visible), time) > 0.5
   return 100 * weights(time)[~seen].sum() / (time[-1] - time[0])
+
+
+@metric("Off centre", "%", "efficiency", "all", "PMC6465181: centre the target")
+def off_centre(time: ArrayLike, centred: ArrayLike) -> float:
+  """Returns the share of time that what is shown is off the picture's middle [%], lower is better.
+
+  Args:
+    time: sample times [s]  (nstep,)
+    centred: 1 where what is to be shown is in the middle of the camera's view, else 0  (nstep,)
+  """
+  time = check_time(time)
+  shown = same("centred", rows("centred", centred), time) > 0.5
+  return 100 * weights(time)[~shown].sum() / (time[-1] - time[0])
+
+
+@metric("Horizon angle", "rad", "dexterity", "all", "this project: a level picture")
+def horizon_angle(time: ArrayLike, horizon: ArrayLike) -> float:
+  """Returns the mean angle of the picture against the horizon [rad], lower is better.
+
+  Args:
+    time: sample times [s]  (nstep,)
+    horizon: angle of the picture's right against the horizontal [rad]  (nstep,)
+  """
+  time = check_time(time)
+  angle = np.abs(same("horizon", rows("horizon", horizon), time))
+  return (weights(time) * angle).sum() / (time[-1] - time[0])

@@ -91,7 +91,7 @@ def test_attached_twice_under_rotated_frames(name, handle):
 def test_mjcf_attach_and_scene():
   folder = trocar_lib.path("probe").parent
   model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
-  assert [model.body(f"{name}/tip").id > 0 for name in NAMES] == [True] * 5
+  assert [model.body(f"{name}/tip").id > 0 for name in NAMES] == [True] * len(NAMES)
   data = mujoco.MjData(model)
   _step(model, data, 0.05)
   assert _quiet(data)
@@ -160,7 +160,7 @@ def test_out_of_reach_says_what_and_why():
   with pytest.raises(ValueError, match="expected a number"):
     inverse(trocar, [np.nan, 0, -0.1])
   assert inverse(trocar, [0, 0, -0.5], check=False)[2] == pytest.approx(0.38)
-  with pytest.raises(ValueError, match="probe, grasper, scissors, hook, scalpel"):
+  with pytest.raises(ValueError, match="probe, grasper, scissors, hook, scalpel, laparoscope"):
     trocar_lib.path("drill")
   model, data = _load("probe")
   with pytest.raises(ValueError, match="no instrument with the prefix 'x/'"):

@@ -16,7 +16,7 @@ from palpate.tasks.core import performer, scenes  # noqa: E402
 LIMITS = {"contact_force": 0.02, "shaft_force": 0.02, "peak_force": 0.02, "gripper": 0.1}
 LIMITS |= {"joint_vel": 5e-3, "traction": 0.02}
 ENDING = "touch/easy", "trace/easy", "grasp/easy", "retract/easy", "dissect/easy"
-ENDING += ("bimanual/easy", "cut/easy")
+ENDING += ("bimanual/easy", "cut/easy", "navigate/hard")
 
 
 def ids(task):
@@ -93,6 +93,7 @@ def compare_metrics(told, k, expected):
     ("tease/easy", 1, 76, {}),
     ("bimanual/easy", 1, 230, {"wanted": 0.03}),
     ("cut/easy", 1, 260, {"radius": 0.006}),
+    ("navigate/hard", 1, 153, {"variants": (None,), "marks": 1, "hold": 0.1, "follow": 0.3}),
   ],
 )
 def test_each_world_is_the_single_environment_of_its_seed(task, count, steps, options):
@@ -123,7 +124,9 @@ def test_each_world_is_the_single_environment_of_its_seed(task, count, steps, op
   env.close()
 
 
-@pytest.mark.parametrize("task", ["touch/easy", "probe/palpate_easy", "grasp/easy"])
+@pytest.mark.parametrize(
+  "task", ["touch/easy", "probe/palpate_easy", "grasp/easy", "navigate/standard"]
+)
 def test_worlds_of_the_gpu_backend_are_the_single_environment(task):
   env, experts = make(task, 2, device="warp-cpu"), Experts(task, 2, 3)
   env.reset(seed=3)

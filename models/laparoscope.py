@@ -1,0 +1,104 @@
+"""Where a laparoscope looks from and to, by its joints, and the joints that show a place.
+
+The lens is the instrument's tip, see `trocar`. The optics look down past the shaft by an angle,
+0 or 30 degrees: with `roll` zero towards -y of the instrument's frame, and about the shaft with
+`roll`. The camera's head turns the picture about its middle. Lengths are in m, angles in rad.
+"""
+
+import math
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from .trocar import Trocar, forward, inverse
+
+NAME = "laparoscope"
+OPTICS = math.radians(30.0)
+
+
+class Pose(NamedTuple):
+  """The joints of a laparoscope: pitch, yaw, roll, insertion, and the camera's head."""
+
+  pitch: float
+  yaw: float
+  roll: float
+  insertion: float
+  head: float
+
+
+def turned(optics: float) -> np.ndarray:
+  """Returns how the body `eye` is turned against the tip, w x y z."""
+  return np.array([math.cos(optics / 2), -math.sin(optics / 2), 0.0, 0.0])
+
+
+def view(port: Trocar, joints, optics: float = OPTICS) -> tuple[np.ndarray, np.ndarray]:
+  """Returns where the lens is (3,), and the picture's axes right, up, back in columns (3, 3).
+
+  Args:
+    port: of the laparoscope
+    joints: as of `Pose`
+    optics: angle between shaft and view
+  """
+  pitch, yaw, roll, insertion, head = joints
+  turn = port.mat @ _about(0, pitch) @ _about(1, -yaw) @ _about(2, -roll)
+  return forward(port, (pitch, yaw, insertion)), turn @ _about(0, -optics) @ _about(2, head)
+
+
+def level(mat: np.ndarray) -> float:
+  """Returns the angle of a picture against the horizon; positive where its right is higher."""
+  return math.atan2(mat[2, 0], mat[2, 1])
+
+
+def show(port: Trocar, place, far: float, side, optics: float = OPTICS) -> Pose:
+  """Returns the joints that have a place in the middle of a level picture; they may be any number.
+
+  Args:
+    port: of the laparoscope
+    place: in the world  (3,)
+    far: from the lens
+    side: direction that it is seen from, as far as the optics allow  (3,)
+    optics: angle between shaft and view
+  """
+  way = np.subtract(place, port.pos)
+  reach = float(np.linalg.norm(way))
+  along, lean = way / reach, math.asin(min(far * math.sin(optics) / reach, 1.0))
+  aside = np.subtract(side, np.dot(side, along) * along)
+  aside = aside / max(float(np.linalg.norm(aside)), 1e-9)
+  depth = reach * math.cos(lean) - far * math.cos(optics)
+  lens = port.pos + depth * (math.cos(lean) * along + math.sin(lean) * aside)
+  pitch, yaw, insertion = inverse(port, lens, check=False)
+  straight = port.mat @ _about(0, pitch) @ _about(1, -yaw)
+  x, y, _ = straight.T @ (place - lens)
+  roll = math.atan2(-x, -y) if optics else 0.0
+  joints = Pose(pitch, yaw, roll, insertion, 0.0)
+  return joints._replace(head=-level(view(port, joints, optics)[1]))
+
+
+def behind(pos, mat, depth: float, optics: float = OPTICS) -> Trocar:
+  """Returns the port of a laparoscope that has a view with pitch, yaw, roll and head zero.
+
+  Args:
+    pos: of the lens  (3,)
+    mat: the picture's axes right, up, back in columns  (3, 3)
+    depth: from port to lens, with the insertion zero
+    optics: angle between shaft and view
+  """
+  turn = np.asarray(mat) @ _about(0, optics)
+  return Trocar(NAME, np.asarray(pos) + depth * turn[:, 2], turn, depth)
+
+
+def orientation(mat: np.ndarray) -> np.ndarray:
+  """Returns the quaternion of a matrix, w x y z."""
+  quat = np.zeros(4)
+  mujoco.mju_mat2Quat(quat, np.ascontiguousarray(mat).ravel())
+  return quat
+
+
+def _about(axis: int, angle: float) -> np.ndarray:
+  """Returns the rotation about an axis."""
+  out, (j, k) = np.eye(3), ((axis + 1) % 3, (axis + 2) % 3)
+  out[j, j] = out[k, k] = math.cos(angle)
+  out[k, j] = math.sin(angle)
+  out[j, k] = -out[k, j]
+  return out
