@@ -97,7 +97,7 @@ class Task(engine.Task):
   outcome: str | None = None
   events: list[Event]
   targets = 1
-  away = (0.03, 0.045)  # from the place of work to the tip, where an episode begins [m]
+  clearance = (0.03, 0.045)  # from the place of work to the tip, where an episode begins [m]
 
   def __init__(
     self,
@@ -332,7 +332,7 @@ class Task(engine.Task):
       port = hand.trocar()
       away = (port.pos - center) / np.linalg.norm(port.pos - center)
       aside = self.random.uniform(-0.015, 0.015, 3)
-      tip = center + (self.random.uniform(*self.away) + back) * away + aside
+      tip = center + (self.random.uniform(*self.clearance) + back) * away + aside
       joints = trocar.inverse(port, tip)
       pose = np.array([joints[0], joints[1], self.random.uniform(-0.5, 0.5), joints[2]])
       hand.set_joints(pose)

@@ -289,7 +289,7 @@ class Navigate(Task):
     mark=mark,
   )
   watch = ("drop", "unintended_contact")
-  away = (0.085, 0.105)
+  clearance = (0.085, 0.105)
 
   def __init__(
     self,
