@@ -25,6 +25,8 @@ STATES = {
   "exercise": (WIDE, "[data-task='touch/easy']", {"z": 100}, False),
   "warning": (WIDE, "[data-task='grasp/easy']", {"d": 2500}, False),
   "two_hands": (WIDE, "[data-task='bimanual/easy']", {"d": 200}, False),
+  "navigate": (WIDE, "[data-task='navigate/standard']", {"s": 500, "b": 400}, False),
+  "camera": (WIDE, "[data-task='grasp/easy']", {"j": 900, "n": 700}, False),
   "card": (WIDE, "[data-task='touch/easy']", {"d": 300}, True),
   "practice": (WIDE, "#tab-practice", {}, False),
   "phone": (PHONE, "[data-task='trace/easy']", {"d": 200}, False),

@@ -15,6 +15,7 @@ from .trocar import Trocar, forward, inverse
 
 NAME = "laparoscope"
 OPTICS = math.radians(30.0)
+BESIDE = 0.006  # from the lens to its lamp
 
 
 class Pose(NamedTuple):
@@ -86,6 +87,23 @@ def behind(pos, mat, depth: float, optics: float = OPTICS) -> Trocar:
   """
   turn = np.asarray(mat) @ _about(0, optics)
   return Trocar(NAME, np.asarray(pos) + depth * turn[:, 2], turn, depth)
+
+
+def stand(model: mujoco.MjModel, camera: int, lamp: int, row) -> None:
+  """Puts a camera of the world, and the lamp at its lens, somewhere.
+
+  Args:
+    model: changed in place
+    camera: its number
+    lamp: its number, -1 for none
+    row: place of the lens and orientation of the picture, w x y z  (7,)
+  """
+  model.cam_pos[camera], model.cam_quat[camera] = row[:3], row[3:]
+  if lamp >= 0:
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, np.asarray(row[3:], float))
+    axes = axes.reshape(3, 3)
+    model.light_pos[lamp], model.light_dir[lamp] = row[:3] + BESIDE * axes[:, 0], -axes[:, 2]
 
 
 def orientation(mat: np.ndarray) -> np.ndarray:

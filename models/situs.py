@@ -19,7 +19,7 @@ import numpy as np
 from palpate import skins
 from palpate import windows as author
 
-from . import catalog, markup, organs, scene, scenery, texture, trocar
+from . import catalog, laparoscope, markup, organs, scene, scenery, texture, trocar
 from .scenery import Surface
 
 NAMES = ("liver", "gallbladder", "stomach")  # organs, in the order they are drawn
@@ -381,11 +381,15 @@ def light(spec: mujoco.MjSpec, pos, target, eye: str = "") -> None:
   forward = np.subtract(target, pos)
   # Beside the lens: what reflects it is not all in the picture's middle.
   beside = np.cross(forward, [0.0, 0.0, 1.0])
-  beside *= 0.006 / np.linalg.norm(beside)
+  beside *= laparoscope.BESIDE / np.linalg.norm(beside)
   near = min(1.0, np.polyval(_FADE[::-1], np.linalg.norm(forward)))  # exposed for what is near
   body, place = (spec.worldbody, np.asarray(pos) + beside)
   if eye:
-    body, place, forward = spec.body(eye), np.array([0.006, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
+    body, place, forward = (
+      spec.body(eye),
+      np.array([laparoscope.BESIDE, 0.0, 0.0]),
+      np.array([0.0, 0.0, -1.0]),
+    )
   body.add_light(
     name=LIGHT,
     pos=place,

@@ -277,8 +277,10 @@ class Task(engine.Task):
     return {}
 
   def arrays(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns the arrays of a control step for a recording: the action, and what hands felt."""
+    """Returns the arrays of a control step: action, what hands felt, where a laparoscope went."""
     arrays = {"action": self.action}
+    if physics.looked is not None:
+      arrays["laparoscope"] = physics.looked
     if self.scene.handle:
       arrays["felt"] = physics.felt()
       if physics.second:

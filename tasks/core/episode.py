@@ -159,15 +159,20 @@ def replay(
   """
   env = env or environment(recording)
   actions = iter(recording.arrays.get("action", np.zeros((0, 0)))[1:])
+  views = iter(recording.arrays.get("laparoscope", np.zeros((0, 7)))[1:])
 
   class _Over(Exception):
     pass
 
   def act(_) -> np.ndarray:
     try:
-      return next(actions)
+      action = next(actions)
     except StopIteration:
       raise _Over from None
+    view = next(views, None)
+    if view is not None and np.isfinite(view).all():
+      env.physics.look_from(view)
+    return action
 
   kept = {k: v for k, v in recording.info.items() if k not in ("outcome", "return", "error")}
   try:

@@ -10,6 +10,7 @@ from typing import Any
 import mujoco as mj
 import numpy as np
 from palpate import Organ
+from palpate.models import laparoscope
 from palpate.tissue.config import Config
 from scipy.spatial import cKDTree
 
@@ -17,8 +18,8 @@ from ..learn.portable import Portable
 from ..metrics.samples import Stretch
 from . import scenes
 from .engine import wrap
-from .instrument import AXES, JAWS, Instrument, Second
-from .scenes import CAMERA, GUIDED, ORGAN
+from .instrument import AXES, JAWS, SCOPE, Instrument, Second
+from .scenes import CAMERA, GUIDED, LIGHT, ORGAN
 from .stage import STATE
 
 NEAR, COARSE = 8, 32  # nodes in the observations
@@ -35,12 +36,14 @@ class Physics(Instrument, Portable):
   Attributes:
     second: the instrument of the other hand, None where there is none
     guided: an instrument that the exercise itself moves, in nobody's hand; None for none
+    looked: where `look_from` has put the laparoscope, and its orientation; None where it stands
     meanwhile: called in the middle of every `step`, with what need not be done at its end, where a
       live exercise has least time; None for nothing
   """
 
   second: Second | None = None
   guided: Second | None = None
+  looked: np.ndarray | None = None
   meanwhile: Callable[[], None] | None = None
 
   def use(
@@ -128,6 +131,7 @@ class Physics(Instrument, Portable):
   def quiet(self) -> None:
     """See `Instrument`; of all."""
     super().quiet()
+    self.looked = None
     if self.second:
       self.second.quiet()
 
@@ -259,7 +263,9 @@ class Physics(Instrument, Portable):
     return area
 
   def tip_visible(self) -> bool:
-    """Whether the laparoscope's picture holds the tip."""
+    """Whether the laparoscope's picture holds the tip; that of the laparoscope is its lens."""
+    if self.prefix == SCOPE:
+      return True
     return self.visible(self.data.ptr.sensordata[self._sensors["tip_pos"]])
 
   def visible(self, point: np.ndarray) -> bool:
@@ -272,6 +278,20 @@ class Physics(Instrument, Portable):
     half = depth * math.tan(math.radians(float(self.model.ptr.cam_fovy[k])) / 2)
     across, up = m[0] * x + m[3] * y + m[6] * z, m[1] * x + m[4] * y + m[7] * z
     return depth > 0 and abs(up) <= half and abs(across) <= half * 4 / 3
+
+  def look_from(self, row: np.ndarray) -> None:
+    """Puts a laparoscope that stands elsewhere, from the next step on.
+
+    What is hidden is so from where it stood when the episode began.
+
+    Args:
+      row: place of the lens [m] and orientation of the picture, w x y z  (7,)
+    """
+    if self.looked is None:
+      self._eye = self.camera()[0]
+    model, lamp = self.model.ptr, mj.mjtObj.mjOBJ_LIGHT
+    laparoscope.stand(model, self._camera, mj.mj_name2id(model, lamp, LIGHT), row)
+    self.looked = row
 
   def camera(self) -> tuple[np.ndarray, np.ndarray, float]:
     """Returns the laparoscope's position [m], axes and vertical field of view [deg]."""
@@ -287,7 +307,7 @@ class Physics(Instrument, Portable):
 
     Rays against triangles after Moeller and Trumbore 1997.
     """
-    eye = self.camera()[0]
+    eye = self.camera()[0] if self.looked is None else self._eye
     a, b, c = np.moveaxis(self.nodes()[self.organ.elem], 1, 0)
     e1, e2, s = b - a, c - a, eye - a
     q = _cross(s, e1)

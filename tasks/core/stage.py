@@ -29,6 +29,7 @@ _CHANGED = (
   "geom_friction",
   "light_ambient",
   "light_diffuse",
+  "light_dir",
   "light_pos",
   "light_specular",
   "mat_rgba",

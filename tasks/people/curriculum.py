@@ -12,6 +12,7 @@ from .score import CONSECUTIVE, REPEATS, trained
 # Exercise -> the one to be proficient in first. In the order in which they are recommended.
 AFTER: dict[str, str | None] = {
   "touch/easy": None,
+  "navigate/easy": None,
   "probe/easy": "touch/easy",
   "trace/easy": "touch/easy",
   "grasp/easy": "touch/easy",

@@ -36,6 +36,8 @@ _ADVICE = {
   "idle_time": "plan the next movement during the present one",
   "idle_share": "plan the next movement during the present one",
   "out_of_view": "keep the tip in the picture",
+  "off_centre": "keep what is worked on in the middle of the picture",
+  "horizon_angle": "turn the camera back whenever you roll the scope",
   "errors": "touch only what is asked for",
   "grasp_slips": "take more tissue between the jaws before you pull",
   "target_error": "look at the target from where the light shows its place, then touch",

@@ -121,6 +121,7 @@ class Link:
     message: the last fault, for people
     row: place [m] and orientation of the anchor  (7,)
     jaw: opening of the jaws [-]
+    head: what the hand says of a camera's head, which takes the place of jaws [-]
     grip: whether the button that closes jaws, or switches a current on, is held
     report: whether a place is reported now
     force: last force sent [N], in the device's axes
@@ -141,6 +142,7 @@ class Link:
     self.force: Three = STILL
     self.state, self.message = "waiting", ""
     self.row, self.jaw, self.paused = [0.0] * 3 + list(_SAME), 1.0, False
+    self.head = 0.0
     self.grip = self.report = False
     self.energy, self._asked = _LENT, False
     self._place, self._turn = Track(h), Track(h)
@@ -170,6 +172,10 @@ class Link:
       self._roll = shaft.roll(pos, quat)
     self._hold([float(x) for x in pos], tuple(float(x) for x in quat))
     self.state = "waiting"
+
+  def turn(self, axes: np.ndarray) -> None:
+    """Takes other axes, as those of a picture that has turned; nothing moves by this."""
+    self._axes, self._reference = [float(x) for x in axes.ravel()], None
 
   def _hold(self, pos: list[float], quat: tuple[float, ...]) -> None:
     self.row = [*pos, *quat]
@@ -256,7 +262,7 @@ class Link:
     self.paused ^= asks and self._asked
     self.grip, self.report = "grip" in buttons, "report" in buttons
     if jaw is not None:
-      self.jaw = min(max(jaw, -1.0), 1.0)
+      self.jaw = self.head = min(max(jaw, -1.0), 1.0)
     elif buttons or self.jaw != 1.0:
       step, target = _CLOSE / self.device.rate, _OPEN if "grip" in buttons else 1.0
       self.jaw += min(max(target - self.jaw, -step), step)

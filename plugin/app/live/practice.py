@@ -14,9 +14,10 @@ import mujoco as mj
 import numpy as np
 import palpate
 from palpate import Organ, models, windows
-from palpate.models import situs, trocar
+from palpate.models import laparoscope, situs, trocar
 from palpate.organ import instances
 
+from . import scope as scopes
 from .coupling import Link, Options
 from .devices.device import Device
 from .loop import Loop
@@ -51,6 +52,7 @@ class Practice:
     pace: of the loop
     links: between devices and instruments, the right hand's first
     camera: that frames are made by
+    scope: laparoscope that a hand holds or that follows, None where it stands
     faults: what went wrong on the way, for people
   """
 
@@ -66,6 +68,7 @@ class Practice:
     pace: Pace | None = None,
     on: str = "",
     scene: pathlib.Path | None = None,
+    holder: Device | None = None,
   ):
     """Prepares the scene.
 
@@ -81,6 +84,7 @@ class Practice:
       pace: real time by default
       on: device that the organ is computed on, such as "cuda:0"; empty for its own choice
       scene: MJCF file in place of `organ` and `size`
+      holder: device that holds the laparoscope, None where it stands
     """
     made = own(scene, tuple(hands)) if scene else furnished(organ, size, tuple(hands))
     spec, name = made
@@ -102,6 +106,8 @@ class Practice:
     self._loop = Loop(self.model, self.data, named, options, self.pace)
     self.links: list[Link] = self._loop.links
     self.camera = Camera(self.model, self.data, self.organ, next(iter(named)))
+    self._eye, self._lamp = self.model.camera(laparoscope.NAME).id, self._light()
+    self._holder, self.scope = holder, scopes.of(self.model, self.data, holder) if holder else None
 
   @property
   def link(self) -> Link:
@@ -132,8 +138,9 @@ class Practice:
         self._publish(self)  # the shapes of a scene take longer than a step
       self._loop.run(watch=self._watch, realtime=first)
     finally:
-      for link in self.links:
-        link.device.close()
+      for device in [*(link.device for link in self.links), self._holder]:
+        if device is not None:
+          device.close()
 
   def _spare(self) -> bool:
     """Returns whether steps leave time to others."""
@@ -159,8 +166,28 @@ class Practice:
       self._diverged()
     for link in self.links:
       self._note(link.message)
+    self._look_on()
     if self._publish is not None:
       self._publish(self)
+
+  def _light(self) -> int:
+    """Returns the number of the lamp at the lens, -1 for none."""
+    found = [
+      mj.mj_name2id(self.model, mj.mjtObj.mjOBJ_LIGHT, n) for n in (situs.LIGHT, situs.CAMERA)
+    ]
+    return max(found)
+
+  def _look_on(self) -> None:
+    """Takes the laparoscope on, and the hands' axes with its picture."""
+    tip = self.data.site_xpos[self.model.site(f"{self._names[0]}tip").id]
+    moved = self.scope is not None and self.scope.advance(
+      self.pace.now, 1 / FPS, tip, self.organ.xpos
+    )
+    if moved and self.scope is not None:
+      row = np.concatenate([self.scope.pos, laparoscope.orientation(self.scope.mat)])
+      laparoscope.stand(self.model, self._eye, self._lamp, row)
+      for link in self.links:
+        link.turn(self.scope.mat)
 
   def _switch(self) -> None:
     self.organ.configure(integrator=self._wanted)

@@ -8,11 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from palpate.models import laparoscope
 from palpate.models.handle import Shaft
 from palpate.tasks.core import episode
 from palpate.tasks.core.handle import ROW
 from palpate.tasks.recording import Recording
 
+from . import scope as scopes
 from .coupling import Link, Options
 from .devices.device import Device
 from .loop import axes, tick
@@ -22,9 +24,11 @@ _FPS = 60  # of what is published
 # What a hand says for each of the components that do not move its instrument as a whole.
 _SAYS: dict[str, Callable[[Link], float]] = {
   "jaw": lambda link: link.jaw,
+  "head": lambda link: link.head,
   "report": lambda link: float(link.report),
   "current": lambda link: 1.0 if link.grip else -1.0,
 }
+_TURNED = 0.01  # of a picture's axes, from which on hands move by the new ones
 _FIRST = ("current",)  # of these, what acts as a control step begins, and does not change in it
 
 
@@ -38,6 +42,7 @@ class Session:
     env: of the suite, with `input="handle"`
     pace: of the loop
     links: between devices and instruments, the main one first
+    scope: laparoscope that a hand holds or that follows, None where the camera is an instrument's
     faults: what went wrong on the way, for people
   """
 
@@ -52,6 +57,7 @@ class Session:
     coach: Any = None,
     publish: Callable[[Session], None] | None = None,
     other: Device | None = None,
+    camera: Device | None = None,
     journal: str | os.PathLike[str] | None = None,
   ):
     """Prepares the exercise.
@@ -67,6 +73,7 @@ class Session:
       publish: called before the first step, and then 60 times a second, in the loop's thread: to
         copy what pictures need, no more
       other: device of the other hand, where the exercise has two
+      camera: device that holds the laparoscope, None where it stands
       journal: file that takes the exercise second by second, see `Recorder`
     """
     if not env.task.scene.handle:
@@ -79,6 +86,8 @@ class Session:
     h = env.physics.timestep()
     self.links = [Link(each, options, h) for each in (device, other) if each is not None]
     self.faults: list[str] = []
+    self.scope: scopes.Scope | None = None
+    self._camera, self._turned = camera, np.eye(3)
     self._info, self._publish, self._journal = dict(info or {}), publish, journal
     self._rows = np.zeros((episode.substeps(env), len(env.task.components)))
     self._held: list[tuple[int, Link, Callable[[Link], float]]] = []  # columns of `_FIRST`
@@ -113,6 +122,8 @@ class Session:
         hand.guide.live = None
         link.quiet()
         link.device.close()
+      if self._camera is not None:
+        self._camera.close()
     made.info["live"] = self.pace.lateness.summary() | {"faults": self.faults}
     if self.coach is not None:
       made.info["coach"] = self.coach.log()
@@ -121,7 +132,12 @@ class Session:
   def _act(self, timestep: Any) -> np.ndarray:
     physics, task = self.env.physics, self.env.task
     if timestep.first():
-      turn = axes(physics.model.ptr, physics.data.ptr)
+      self._turned = turn = axes(physics.model.ptr, physics.data.ptr)
+      follows = self.scope is not None and self.scope.follows
+      if self._camera is not None:
+        self.scope = scopes.of(physics.model.ptr, physics.data.ptr, self._camera)
+        if self.scope is not None:
+          self.scope.follows = follows
       self._rows[:] = 0.0
       self._held.clear()
       first, extras = 0, (task.extra, task.other)
@@ -139,9 +155,23 @@ class Session:
         self.coach.begin(self.env)
       if self._publish is not None:
         self._publish(self)  # the shapes of a scene take longer than a step
+    else:
+      self._look_on()
     for column, link, say in self._held:
       self._rows[:, column] = say(link)
     return self._rows
+
+  def _look_on(self) -> None:
+    """Takes the laparoscope on, and the hands' axes with its picture."""
+    physics, scope = self.env.physics, self.scope
+    dt = self.env.control_timestep()
+    if scope is not None and scope.advance(self.pace.now, dt, physics.tip_pos(), physics.nodes()):
+      physics.look_from(np.concatenate([scope.pos, laparoscope.orientation(scope.mat)]))
+    now = axes(physics.model.ptr, physics.data.ptr)
+    if np.abs(now - self._turned).max() > _TURNED:
+      self._turned = now
+      for link in self.links:
+        link.turn(now)
 
   def _live(
     self, link: Link, says: Sequence[tuple[int, Callable[[Link], float]]], rows: np.ndarray, k: int

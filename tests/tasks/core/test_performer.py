@@ -23,6 +23,9 @@ LONG |= {
   for task in ("easy", "standard", "hard")
 }
 
+# Who holds the laparoscope meets nothing; marks without a pin have no side.
+NOTHING_MET = {"contact_force", "peak_force", "surface", "side"}
+
 
 def wins(name, seeds):
   env = tasks.load(*suite.split(name), task_kwargs={"random": 0})
@@ -42,7 +45,7 @@ def wins(name, seeds):
       if key in BELOW:
         worst = np.linalg.norm(values, axis=1).max()
         assert worst < BELOW[key], f"observation {key} reaches {worst}"
-      elif key not in UNTOUCHED:
+      elif key not in UNTOUCHED | (NOTHING_MET if name.startswith("navigate/") else set()):
         assert np.ptp(values, axis=0).max() > 0, f"observation {key} is constant"
   return count
 

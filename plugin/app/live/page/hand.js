@@ -4,12 +4,17 @@ const KEYS = {
   ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowDown: [1, -1], ArrowUp: [1, 1], a: [0, -1], d: [0, 1],
   s: [1, -1], w: [1, 1], q: [2, -1], e: [2, 1], z: [3, -1], x: [3, 1],
 };
+const SCOPE = {
+  j: [0, -1], l: [0, 1], k: [1, -1], i: [1, 1], u: [2, -1], o: [2, 1], n: [3, -1], m: [3, 1],
+};
+const TILT = {b: 1, v: -1};  // of the camera, against the scope
 const HOLD = {g: "grip", " ": "grip", r: "report", c: "clutch"};
 const DEPTH = 2e-5;  // of the wheel [m]
 const PINCH = 3e-4;  // of two fingers [m]
 const ROLL = 0.01;  // [rad]
 const MOST = 0.04;  // in a message [m]
 const DEAD = 0.1;
+const TILTS = 0.2;  // of the camera, half turns a second
 export const CLOCK = 1e6;  // in which the clock of messages goes round [ms]
 
 export class Hand {
@@ -24,6 +29,9 @@ export class Hand {
     this.said = {};
     this.since = null;  // of the first movement that was not told yet
     this.left = "";  // what is in the left hand: keyboard, pad
+    this.scope = false;  // whether what moves the instrument moves the laparoscope
+    this.turns = false;  // whether the instrument itself is one, whose camera turns
+    this.begin();
     canvas.addEventListener("pointerdown", event => this.press(canvas, event));
     canvas.addEventListener("pointermove", event => this.drag(event));
     for (const kind of ["pointerup", "pointercancel"]) {
@@ -38,6 +46,12 @@ export class Hand {
     canvas.addEventListener("keyup", event => this.key(event, false));
     canvas.addEventListener("blur", () => this.down.clear());
     for (const button of pad.querySelectorAll("button")) this.button(button);
+  }
+
+  // An exercise begins: the camera is not turned.
+  begin() {
+    this.tilt = 0;  // of the camera, half turns
+    this.tilted = performance.now();
   }
 
   // A button is held; the one that grips stays closed until it is pressed again.
@@ -112,7 +126,7 @@ export class Hand {
 
   key(event, down) {
     const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-    if (!(name in KEYS || name in HOLD)) return;
+    if (![KEYS, HOLD, SCOPE, TILT].some(keys => name in keys)) return;
     event.preventDefault();
     if (down) this.down.add(name);
     else this.down.delete(name);
@@ -122,9 +136,24 @@ export class Hand {
     const rate = [0, 0, 0, 0], held = [];
     for (const name of this.down) {
       if (name in KEYS) rate[KEYS[name][0]] += KEYS[name][1];
-      else held.push(HOLD[name]);
+      else if (name in HOLD) held.push(HOLD[name]);
     }
     return {rate, held};
+  }
+
+  // Keys that move the laparoscope.
+  view_keys() {
+    const rate = [0, 0, 0, 0];
+    for (const name of this.down) if (name in SCOPE) rate[SCOPE[name][0]] += SCOPE[name][1];
+    return {rate, held: []};
+  }
+
+  // Turns the camera for as long as keys or buttons ask for it.
+  lean() {
+    const now = performance.now(), buttons = [...this.pressed].map(({dataset}) => Number(dataset.tilt ?? 0));
+    const way = buttons.reduce((a, b) => a + b, 0) + [...this.down].reduce((sum, name) => sum + (TILT[name] ?? 0), 0);
+    this.tilt = Math.min(Math.max(this.tilt + way * TILTS * Math.min(now - this.tilted, 100) / 1e3, -1), 1);
+    this.tilted = now;
   }
 
   pads() {
@@ -142,7 +171,7 @@ export class Hand {
     const rate = [0, 0, 0, 0], held = this.grip ? ["grip"] : [];
     for (const {dataset} of this.pressed) {
       if (dataset.hold) held.push(dataset.hold);
-      else {
+      else if (dataset.rate) {
         const [axis, way] = dataset.rate.split(",").map(Number);
         rate[axis] += way;
       }
@@ -157,7 +186,13 @@ export class Hand {
     this.move = [0, 0, 0, 0];
     if (left !== "keyboard") right.push(keys);
     if (left !== "pad") right.push(pads);
-    const out = [this.words("right", right, move)];
+    this.lean();
+    const views = [this.view_keys()];
+    if (this.scope) views.push(...right);
+    const none = [0, 0, 0, 0], tilt = this.tilt;
+    const out = [this.words("scope", views, this.scope ? move : none, tilt)];
+    if (this.scope) out.push(this.words("right", [], none));
+    else out.push(this.words("right", right, move, this.turns ? tilt : undefined));
     if (left === "keyboard") out.push(this.words("left", [keys], [0, 0, 0, 0]));
     if (left === "pad") out.push(this.words("left", [pads], [0, 0, 0, 0]));
     this.since = null;
@@ -165,11 +200,11 @@ export class Hand {
   }
 
   // Returns the message about a hand, null where nothing is new.
-  words(which, sources, move) {
+  words(which, sources, move, jaw) {
     const rate = [0, 1, 2, 3].map(i => Math.min(Math.max(sources.reduce((sum, s) => sum + s.rate[i], 0), -1), 1));
-    const buttons = [...new Set(sources.flatMap(s => s.held))], rest = JSON.stringify([rate, buttons]);
+    const buttons = [...new Set(sources.flatMap(s => s.held))], rest = JSON.stringify([rate, buttons, jaw]);
     if (rest === this.said[which] && move.every(x => x === 0)) return null;
     this.said[which] = rest;
-    return {type: "hand", which, move, rate, buttons, at: (this.since ?? performance.now()) % CLOCK};
+    return {type: "hand", which, move, rate, buttons, jaw, at: (this.since ?? performance.now()) % CLOCK};
   }
 }

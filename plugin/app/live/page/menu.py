@@ -25,7 +25,6 @@ def offer(device: str, kept: Keeping | None = None, scene: bool = False) -> dict
     kept: whose exercises they are
     scene: whether there is an own scene to practise on
   """
-  from palpate import models
   from palpate.tasks import suite
 
   return {
@@ -44,7 +43,7 @@ def offer(device: str, kept: Keeping | None = None, scene: bool = False) -> dict
     "meshes": meshes(),
     "schemes": SCHEMES,
     "steps": STEPS,
-    "instruments": models.INSTRUMENTS,
+    "instruments": instruments(),
     "processors": processors(),
   }
 
@@ -61,6 +60,14 @@ def _progress(kept: Keeping | None) -> dict[str, dict[str, Any]] | None:
     task: {"tried": len(each), "good": sum(each), "met": task in met}
     for task, each in passed.items()
   }
+
+
+def instruments() -> tuple[str, ...]:
+  """Returns the instruments of free practice, where the laparoscope is beside them."""
+  from palpate import models
+  from palpate.models import laparoscope
+
+  return tuple(name for name in models.INSTRUMENTS if name != laparoscope.NAME)
 
 
 def organs(scene: bool) -> tuple[str, ...]:
@@ -132,12 +139,12 @@ def exercise(message: dict[str, Any], device: str) -> dict[str, Any]:
     "nodes": choice("nodes", message.get("nodes"), (None, *NODES)),
     "left": left or "",
     "assessment": message.get("assessment") is True,
+    "scope": choice("scope", message.get("scope", "page"), devices(device)),
   }
 
 
 def practice(message: dict[str, Any], device: str, scene: bool = False) -> dict[str, Any]:
   """Returns the free practice that a message asks for; ValueError names what is wrong with it."""
-  from palpate import models
 
   def chosen(name: str, default: Any, choices: tuple) -> Any:
     return choice(name, message.get(name, default), choices)
@@ -151,9 +158,10 @@ def practice(message: dict[str, Any], device: str, scene: bool = False) -> dict[
     "size": {"nodes" if kind == "nodes" else "grid": int(count)},
     "scheme": chosen("scheme", "implicit", SCHEMES),
     "step": chosen("step", 1.0, STEPS),
-    "instrument": chosen("instrument", "probe", models.INSTRUMENTS),
+    "instrument": chosen("instrument", "probe", instruments()),
     "left": chosen("left", "", lefts(device)),
     "on": chosen("on", "cpu", processors()),
+    "scope": chosen("scope", "page", devices(device)),
   }
 
 

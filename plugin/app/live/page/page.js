@@ -86,6 +86,7 @@ const HEAR = {
     fill("speed", menu.speeds.map(s => [s, s === 1 ? t("real time") : t("{0} \u00d7 real time", s)]).reverse());
     fill("scale", [1, 0.5, 0.25, 2].map(s => [s, `${s} : 1`]));
     fill("device", menu.devices.map(name => [name, name === "page" ? t("mouse, touch, keys, gamepad") : name]));
+    fill("holder", menu.devices.map(name => [name, name === "page" ? t("keys and buttons of this page") : name]));
     fill("left", menu.lefts.map(name => [name, t({"": "none", keyboard: "keyboard, on this page", pad: "gamepad, on this page"}[name] ?? name)]));
     for (const name of ["organ", "mesh", "scheme", "instrument"]) {
       fill(name, menu[`${name === "mesh" ? "meshe" : name}s`].map(value => [value, value.replace("_", " ")]));
@@ -121,6 +122,12 @@ const HEAR = {
     document.body.classList.toggle("assessment", scene.assessment);
     $("pad-grip").hidden = !scene.jaws;
     $("pad-report").hidden = !scene.report;
+    $("scope").hidden = $("follow").hidden = !scene.scope;
+    for (const button of document.querySelectorAll("[data-tilt]")) button.hidden = !scene.scope && !scene.turns;
+    hand.turns = scene.turns;
+    hand.begin();
+    if (!scene.scope) press("scope", false);
+    else if (on("follow")) say({type: "follow", on: true});
     run(true);
   },
   topology(message) {
@@ -248,7 +255,7 @@ function start() {
   $("more").open = false;
   tell("");
   $("welcome").textContent = "";
-  const common = {speed: Number($("speed").value), scale: Number($("scale").value)};
+  const common = {speed: Number($("speed").value), scale: Number($("scale").value), scope: $("holder").value || "page"};
   tutorial = document.body.dataset.mode === "tutorial" ? new Tutorial() : null;
   if (tutorial) {
     hand.left = "";
@@ -388,12 +395,18 @@ function beep(kind) {
 // The buttons.
 
 const pressed = (id, on) => $(id).setAttribute("aria-pressed", on);
+const on = id => $(id).getAttribute("aria-pressed") === "true";
+function press(id, down) {
+  if (on(id) !== down) $(id).click();
+}
 const toggle = (id, act) => $(id).onclick = () => {
   const on = $(id).getAttribute("aria-pressed") !== "true";
   pressed(id, on);
   act(on);
   $("view").focus();
 };
+toggle("scope", down => hand.scope = down);
+toggle("follow", down => running && say({type: "follow", on: down}));
 toggle("wire", on => view.wire = on);
 toggle("free", on => {
   view.free = on;
@@ -434,6 +447,8 @@ $("view").addEventListener("keydown", event => {
   if (!running) return;
   if (event.key === "p") $("pause").click();
   if (event.key === "h" && !$("ghost").disabled) $("ghost").click();
+  if (event.key === "f" && !$("follow").hidden) $("follow").click();
+  if (event.key === "y" && !$("scope").hidden) $("scope").click();
 });
 document.addEventListener("pointerdown", event => $("more").contains(event.target) || ($("more").open = false));
 if (matchMedia("(pointer: coarse)").matches) document.body.classList.add("touch");

@@ -14,6 +14,7 @@ import mujoco as mj
 import numpy as np
 import trimesh
 from palpate import Organ
+from palpate.models.situs import LIGHT
 from palpate.tissue.geometry import subdivide
 from scipy.sparse import csr_array, vstack
 
@@ -23,10 +24,11 @@ from ..realtime_clock import Pace
 FPS = 60  # frames a second that free practice publishes, at most
 # Numbers at the head of a frame, before the nodes, the bodies' places and the sites; `echo` is the
 # page's own clock when it sent the movement that is shown, `clock` the loop's [s]; `current` is 1
-# while a hook sends one through what it touches.
+# while a hook sends one through what it touches; from `eye_0` on is the camera's matrix, by rows.
 HEAD = (
   "time", "progress", "force", "shaft", "felt", "push", "missed", "steps", "state", "echo", "clock",
   "current", "tip_x", "tip_y", "tip_z", "tip_qw", "tip_qx", "tip_qy", "tip_qz",
+  "eye_x", "eye_y", "eye_z", *(f"eye_{k}" for k in range(9)),
 )  # fmt: skip
 STATES = ("waiting", "ready", "clutch", "lost", "paused")
 _SENSORS = ("tip_force", "shaft_force", "tip_pos", "tip_quat")
@@ -61,6 +63,7 @@ class Camera:
     others = np.flatnonzero(model.site_group <= _SHOWN)
     self._sites = [*sites, *(int(site) for site in others if site not in sites)]
     self._parts = _parts(model)
+    self._eye = model.camera("laparoscope").id
     self._bodies = sorted({body for body, _ in self._parts})
     self._hooks = [s for s in range(model.nsite) if model.site(s).name.endswith(f"{HOOK}tip")]
     self._sensors = [self._sensor(prefix + name) for name in _SENSORS]
@@ -84,8 +87,7 @@ class Camera:
   def shapes(self, **more: Any) -> dict[str, Any]:
     """Returns what is drawn, JSON: organ, parts, scenery, lights, and what the caller adds."""
     model, data = self.model, self._data
-    eye = model.camera("laparoscope").id
-    used = self._used()
+    eye, used = self._eye, self._used()
     textures = {t: _texture(model, t) for t in sorted({_paper(model, m) for m in used}) if t >= 0}
     hooks = [self._bodies.index(int(model.site_bodyid[s])) for s in self._hooks]
     return {
@@ -221,7 +223,7 @@ class Camera:
     head = (
       data.time, progress, force, float(np.linalg.norm(shaft)), hand, self.peak, late.missed,
       late.steps, STATES.index(state), link.device.stamp, pace.now - self._begun, float(current),
-      *pos, *quat,
+      *pos, *quat, *data.cam_xpos[self._eye], *data.cam_xmat[self._eye],
     )  # fmt: skip
     bodies, sites = self._bodies, self._sites
     parts = (
@@ -396,6 +398,7 @@ def _lights(model: mj.MjModel, data: mj.MjData) -> list[dict[str, Any]]:
       "pos": data.light_xpos[k],
       "dir": data.light_xdir[k],
       "directed": bool(directed),
+      "lens": model.light(k).name == LIGHT,
       "cutoff": float(model.light_cutoff[k]),
       "fade": model.light_attenuation[k],
       "colour": model.light_diffuse[k],

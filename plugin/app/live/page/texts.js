@@ -7,7 +7,9 @@ const GERMAN = {
   "More": "Mehr", "device of the hand": "Gerät der Hand", "device of the other hand": "Gerät der anderen Hand", "speed": "Tempo",
   "scale of movements": "Maßstab der Bewegungen", "seed": "Startzahl", "time step": "Zeitschritt", "sound": "Ton", "computed on": "rechnet auf",
   "language": "Sprache", "Start": "Start", "Pause": "Pause", "Resume": "Weiter", "Stop": "Ende", "Free view": "Freie Sicht", "Wireframe": "Netz",
-  "Show me": "Zeig es mir", "Deeper": "Tiefer", "Back": "Zurück", "Grip": "Greifen", "Here": "Hier", "Clutch": "Kuppeln", "roll left": "links drehen",
+  "Show me": "Zeig es mir", "Move the camera": "Kamera bewegen", "Camera follows": "Kamera folgt", "device of the laparoscope": "Gerät des Laparoskops",
+  "keys and buttons of this page": "Tasten und Knöpfe dieser Seite", "turn the camera left": "Kamera links drehen", "turn the camera right": "Kamera rechts drehen",
+  "Deeper": "Tiefer", "Back": "Zurück", "Grip": "Greifen", "Here": "Hier", "Clutch": "Kuppeln", "roll left": "links drehen",
   "roll right": "rechts drehen", "Force": "Kraft", "Force [N]": "Kraft [N]", "Progress": "Fortschritt", "Time": "Zeit",
   "Displacement of the organ at the tip [mm]": "Verschiebung des Organs an der Spitze [mm]", "Speed of the simulation": "Tempo der Simulation",
   "Steps a second": "Schritte je Sekunde", "How to move": "So wird bewegt", "what the laparoscope sees": "was das Laparoskop sieht",
@@ -17,6 +19,8 @@ const GERMAN = {
     "Tasten: Pfeile oder W A S D bewegen im Bild, Q weg und E heran, Z und X drehen. G schließt die Backen, R meldet, C kuppelt, P hält an, H zeigt die Könnerin.",
   "Gamepad: the left stick moves across the picture, the right stick sets depth and roll. The first button grips, the second reports, the third is the clutch.":
     "Gamepad: der linke Stick bewegt im Bild, der rechte stellt Tiefe und Drehung. Der erste Knopf greift, der zweite meldet, der dritte kuppelt.",
+  "Laparoscope: I J K L move it across the picture, U in and O out, N and M roll the scope, V and B turn the camera. F lets it follow the tip. With Y, or Move the camera, everything above moves the laparoscope.":
+    "Laparoskop: I J K L bewegen es im Bild, U hinein und O heraus, N und M drehen die Optik, V und B die Kamera. Mit F folgt es der Spitze. Mit Y, oder Kamera bewegen, bewegt alles Obige das Laparoskop.",
   "Free view: drag to rotate the picture. Two fingers, or Shift and drag, pan it. The wheel or a pinch zooms. Keys and gamepad still move the instrument.":
     "Freie Sicht: ziehen dreht das Bild. Zwei Finger, oder Umschalt und ziehen, schieben es. Rad oder Spreizen vergrößert. Tasten und Gamepad bewegen weiter das Instrument.",
   // Home.
@@ -25,7 +29,7 @@ const GERMAN = {
   "next": "als Nächstes", "done": "geschafft", "proficient": "sicher", "open": "offen", "after {0}": "nach {0}", "{0} of {1} attempts proficient": "{0} von {1} Versuchen sicher",
   "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate_easy": "Tasten, leicht", "palpate_standard": "Tasten, mittel", "palpate_hard": "Tasten, schwer",
   "touch": "Berühren", "probe": "Drücken und Tasten", "trace": "Nachfahren", "grasp": "Greifen", "retract": "Weghalten", "tease": "Ablösen",
-  "dissect": "Abpräparieren", "cut": "Schneiden", "bimanual": "Mit zwei Händen",
+  "dissect": "Abpräparieren", "cut": "Schneiden", "bimanual": "Mit zwei Händen", "navigate": "Kamera führen",
   // What runs.
   "Loading {0}": "Lädt {0}", "Loading {0}, which takes a minute or more": "Lädt {0}, das dauert eine Minute oder mehr",
   "Choose an exercise and press Start.": "Wähle eine Übung und drücke Start.",
@@ -70,6 +74,10 @@ const GERMAN = {
   "Pull it off its bed: # of # % are free": "Zieh es von seinem Bett: # von # % sind frei", "Go under the flap and push gently along, side by side: # of # % are free": "Geh unter den Lappen und schiebe sanft, Seite an Seite: # von # % sind frei",
   "Push the tip of the blade through the line": "Stich die Klinge durch die Linie", "Cut along the line: # % done": "Schneide an der Linie entlang: # % geschafft",
   "Press here and there, and report where it is stiff while you press: # % of the field is felt": "Drücke hier und dort, und melde beim Drücken, wo es hart ist: # % des Felds sind getastet",
+  "Find the yellow mark, # of #": "Finde die gelbe Marke, # von #", "Find the instrument, # of #": "Finde das Instrument, # von #",
+  "Bring the yellow mark into the middle, # of #": "Bring die gelbe Marke in die Mitte, # von #", "Bring the instrument into the middle, # of #": "Bring das Instrument in die Mitte, # von #",
+  "Go nearer": "Geh näher heran", "Go back": "Geh zurück", "Roll the scope until you look along the pin": "Drehe die Optik, bis du den Stift entlang siehst",
+  "Turn the camera until the picture is level": "Drehe die Kamera, bis das Bild gerade steht",
   "Too much force: # N, expected at most # N": "Zu viel Kraft: # N, höchstens # N", "The shaft presses on the organ with # N": "Der Schaft drückt mit # N auf das Organ",
   "You press on what is around with # N": "Du drückst mit # N auf die Umgebung", "The tip is out of the picture": "Die Spitze ist nicht im Bild",
   "Peak force": "Größte Kraft", "Mean force in contact": "Mittlere Kraft im Kontakt", "Force-time product": "Kraft mal Zeit", "Force limit breaches": "Überschreitungen der Kraft",
@@ -77,7 +85,7 @@ const GERMAN = {
   "Grip against pull": "Griff gegen Zug", "Shaft contact": "Kontakt des Schafts", "Peak force of the shaft": "Größte Kraft des Schafts", "Peak traction": "Größter Zug", "Peak tissue strain": "Größte Dehnung",
   "Time to completion": "Zeit", "Path length": "Weglänge", "Mean speed": "Mittleres Tempo", "Peak speed": "Größtes Tempo", "Peak speed in contact": "Größtes Tempo im Kontakt", "Path inefficiency": "Umweg",
   "Log dimensionless jerk": "Ruck (log)", "Angular path": "Drehweg", "Depth path": "Weg in die Tiefe", "Number of movements": "Zahl der Bewegungen", "Idle time": "Ruhezeit", "Idle share": "Anteil der Ruhe",
-  "Out of view": "Nicht im Bild", "Errors": "Fehler", "Grasp slips": "Abgerutscht", "Target error": "Abstand vom Ziel", "Share freed": "Befreiter Anteil", "Mean deviation": "Mittlere Abweichung",
+  "Out of view": "Nicht im Bild", "Off centre": "Nicht in der Mitte", "Horizon angle": "Neigung des Bilds", "Errors": "Fehler", "Grasp slips": "Abgerutscht", "Target error": "Abstand vom Ziel", "Share freed": "Befreiter Anteil", "Mean deviation": "Mittlere Abweichung",
   "Largest deviation": "Größte Abweichung", "Excess tissue": "Gewebe zu viel", "Jagged length": "Gezackte Länge", "Depth of the blade": "Tiefe der Klinge", "Time of current": "Dauer des Stroms",
   "Current without a target": "Strom ohne Ziel", "Tracing error (Frechet)": "Abweichung (Fréchet)", "Tracing error (RMS)": "Abweichung (RMS)", "RMS force in contact": "RMS-Kraft im Kontakt", "Peak contact pressure": "Größter Druck",
   "approach slowly and stop at the first resistance": "nähere dich langsam und halte beim ersten Widerstand", "stay in light contact, less is enough": "bleib in leichtem Kontakt, weniger genügt",
@@ -86,12 +94,13 @@ const GERMAN = {
   "keep the shaft away from the organ; look at more than the tip": "halte den Schaft vom Organ fern; sieh auf mehr als die Spitze", "plan the next movement during the present one": "plane die nächste Bewegung während der jetzigen",
   "go straight to the target": "geh gerade zum Ziel", "make one smooth movement in place of several corrections": "mach eine glatte Bewegung statt mehrerer Korrekturen", "turn the instrument less": "drehe das Instrument weniger",
   "find the depth first, then go in once": "finde erst die Tiefe, dann geh einmal hinein", "make fewer, longer movements": "mach weniger, längere Bewegungen", "keep the tip in the picture": "halte die Spitze im Bild",
+  "keep what is worked on in the middle of the picture": "halte, woran gearbeitet wird, in der Bildmitte", "turn the camera back whenever you roll the scope": "drehe die Kamera zurück, sooft du die Optik drehst",
   "touch only what is asked for": "berühre nur, was verlangt ist", "go around what is not yours to touch": "umgehe, was nicht berührt werden soll", "take more tissue between the jaws before you pull": "nimm mehr Gewebe zwischen die Backen, bevor du ziehst",
   "look at the target from where the light shows its place, then touch": "sieh das Ziel an, wo das Licht seinen Ort zeigt, dann berühre es", "slow down in the bends of the line": "fahre langsamer in den Bögen der Linie",
 };
 const ENGLISH = {
   "touch": "Touch", "probe": "Press and palpate", "trace": "Follow a line", "grasp": "Grasp and lift", "retract": "Hold aside", "tease": "Tease off",
-  "dissect": "Dissect", "cut": "Cut", "bimanual": "With two hands", "easy": "Easy", "standard": "Standard", "hard": "Hard", "depth": "Depth",
+  "dissect": "Dissect", "cut": "Cut", "bimanual": "With two hands", "navigate": "Hold the camera", "easy": "Easy", "standard": "Standard", "hard": "Hard", "depth": "Depth",
   "palpate_easy": "Palpate, easy", "palpate_standard": "Palpate, standard", "palpate_hard": "Palpate, hard",
 };
 export const LANGUAGES = {en: ENGLISH, de: GERMAN};

@@ -5,6 +5,7 @@ import {unpack} from "./numbers.js";
 
 const BODY = 12, SITE = 19;  // numbers of each in a frame
 const LIP = 8e-4;  // width of the edge of a cut [m]
+const BESIDE = 0.006;  // from the lens to its lamp [m]
 const EXPERT = 0x59f2bf;
 const PUFFS = 24;  // of smoke
 const NEAR = 0.005, FAR = 2;  // [m]
@@ -65,7 +66,12 @@ export class View {
     this.world = new THREE.Scene();
     this.world.background = new THREE.Color(0x120505);
     this.papers = new Map(Object.entries(scene.textures).map(([key, value]) => [Number(key), paper(value)]));
-    scene.lights.forEach(light => this.world.add(...lamps(light)));
+    this.lenses = [];  // lamps that go with the eye
+    for (const light of scene.lights) {
+      const made = lamps(light);
+      this.world.add(...made);
+      if (light.lens) this.lenses.push(made[1]);
+    }
     for (const each of scene.scenery) {
       const mesh = new THREE.Mesh(shape(each), this.surface(each.look));
       this.world.add(mesh);
@@ -191,6 +197,7 @@ export class View {
     const {scene, canvas, camera} = this, width = canvas.clientWidth, height = canvas.clientHeight;
     this.gl.setPixelRatio(this.fine);
     this.gl.setSize(width, height, false);
+    this.follow(frame);
     const {at, axes, fovy} = this.eye([head.tip_x, head.tip_y, head.tip_z]);
     camera.fov = fovy;
     camera.aspect = width / Math.max(height, 1);
@@ -207,6 +214,18 @@ export class View {
     this.show(expert, head);
     this.fume(head.current > 0, frame, places);
     this.gl.render(this.world, camera);
+  }
+
+  // Takes the laparoscope's view of a frame; its lamp is beside the lens.
+  follow(frame) {
+    const {camera, head} = this.scene, first = head.indexOf("eye_x");
+    camera.pos = [...frame.subarray(first, first + 3)];
+    camera.mat = [...frame.subarray(first + 3, first + 12)];
+    const [right, , back] = [0, 1, 2].map(j => [camera.mat[j], camera.mat[3 + j], camera.mat[6 + j]]);
+    for (const lamp of this.lenses) {
+      lamp.position.set(...add(camera.pos, scale(right, BESIDE)));
+      lamp.target.position.set(...sub(lamp.position.toArray(), back));
+    }
   }
 
   // Lays the surfaces over the organ's nodes.
@@ -290,7 +309,7 @@ export class View {
   pixel(head) {
     const {at, axes, fovy} = this.eye([head.tip_x, head.tip_y, head.tip_z]);
     const depth = dot(sub(at, [head.tip_x, head.tip_y, head.tip_z]), axes[2]);
-    return 2 * Math.max(depth, 0.02) * Math.tan(fovy * Math.PI / 360) / this.canvas.clientHeight;
+    return 2 * Math.max(depth, 0.05) * Math.tan(fovy * Math.PI / 360) / this.canvas.clientHeight;
   }
 }
 

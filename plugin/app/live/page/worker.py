@@ -35,6 +35,7 @@ from .picture import HOOK, Camera
 _STATUS = 0.1  # between words about the exercise [s]
 _WORDS = (
   "hand", "start", "practice", "scheme", "device", "ghost", "keep", "pause", "speed", "stop",
+  "follow",
 )  # fmt: skip
 
 
@@ -146,7 +147,15 @@ class Worker:
   def _on_hand(self, message: dict[str, Any]) -> None:
     desk = self._desks.get(message.get("which", "right"))
     if desk is not None:
+      if message.get("which") == "scope" and self._now is not None:
+        self._now.pace.waits = False  # a view is a movement too
       desk.feed(**{k: message[k] for k in ("move", "rate", "buttons", "jaw", "at") if k in message})
+
+  def _on_follow(self, message: dict[str, Any]) -> None:
+    scope = self._now.scope if self._now is not None else None
+    if scope is None:
+      raise ValueError("the laparoscope is held by a hand: nothing follows")
+    scope.follows = message.get("on") is True
 
   def _on_start(self, message: dict[str, Any]) -> None:
     self._put(menu.exercise(message, self._own))
@@ -277,11 +286,12 @@ class Worker:
     self._tell({"type": "loading", "text": job["task"], "note": ""})
     kwargs = _kwargs(job)
     env = suite.load(*suite.split(job["task"]), task_kwargs={"random": 0, **kwargs})
-    with self._hands(job["left"]) as (device, other):
+    with self._hands(job["left"], job["scope"]) as (device, other, holder):
       path, info = self._sitting.reserve(job["task"], job["person"])
       session = Session(
         env, device, job["seed"], {"task_kwargs": kwargs, **info}, Options(scale=job["scale"]),
-        coach=Coach(job["assessment"]), publish=self._draw, other=other, journal=path,
+        coach=Coach(job["assessment"]), publish=self._draw, other=other, camera=holder,
+        journal=path,
       )  # fmt: skip
     session.pace.waits = True
     self._foresee(job)
@@ -313,6 +323,7 @@ class Worker:
       self._camera = Camera.of(env)
       task = env.task
       limits = {"force_limit": task.force_limit, "damage": task.damage, "jaws": task.jaws}
+      limits |= {"scope": session.scope is not None, "turns": "head" in task.extra}
       self._tell(self._camera.shapes(
         time_limit=env.step_limit * env.control_timestep(), report="report" in task.extra,
         assessment=self._job["assessment"], practice=False, step=env.physics.timestep(), **limits,
@@ -339,14 +350,14 @@ class Worker:
     text = scene.name if scene else f"{job['organ']}, {job['mesh']}"
     self._tell({"type": "loading", "text": text, "note": note})
     right, left = job["instrument"], job["left"]
-    with self._hands(left) as (device, other):
+    with self._hands(left, job["scope"]) as (device, other, holder):
       hands = {right: device}
       if other is not None:
         hands["grasper" if right != "grasper" else "probe"] = other
       practice = Practice(
         job["organ"], job["size"], hands, 1e-3 * job["step"], job["scheme"],
         Options(scale=job["scale"]), self._picture, on=job["on"] * (job["on"] != "cpu"),
-        scene=scene,
+        scene=scene, holder=holder,
       )  # fmt: skip
     self._run(practice, job, lambda: practice.run(realtime=True))
     self._tell({"type": "idle", "late": practice.pace.lateness.summary()})
@@ -359,20 +370,26 @@ class Worker:
       self._tell(camera.shapes(
         force_limit=LIMIT, damage=DAMAGE, jaws=self._job["instrument"] != "probe", time_limit=None,
         report=False, assessment=False, practice=True, step=1e-3 * self._job["step"],
+        scope=practice.scope is not None, turns=False,
       ))  # fmt: skip
     self._follow(camera)
     self._publish(lambda: camera.frame(practice.link, practice.pace, powered=practice.powered))
 
   @contextlib.contextmanager
-  def _hands(self, left: str) -> Iterator[tuple[Device, Device | None]]:
-    """Opens the devices of both hands, the left one's if it has a name; closes them on failure."""
+  def _hands(self, left: str, scope: str) -> Iterator[tuple[Device, Device | None, Device]]:
+    """Opens the devices of both hands, the left one's if it has a name, and the laparoscope's.
+
+    It closes them on failure.
+    """
     with contextlib.ExitStack() as stack:
       right, other = self._open(self._device), None
       stack.callback(right.close)
       if left:
         other = self._open("page" if left in menu.OTHER else left, "left")
         stack.callback(other.close)
-      yield right, other
+      holder = self._open(scope, "scope")
+      stack.callback(holder.close)
+      yield right, other, holder
       stack.pop_all()
 
   def _open(self, name: str, which: str = "right") -> Device:
