@@ -48,7 +48,6 @@ from ..core.rules import (
   normal,
   picture,
   point,
-  reach,
   root,
   sine,
   vector,
@@ -223,7 +222,6 @@ def advance(s, o):
     o.time = 0.0
   wanted = o.follow if follows(o) else o.hold
   if o.time >= wanted - SLACK:
-    reach(s, o, aside(v))
     o.done = o.done + 1
     o.time = 0.0
     if o.done < count(o):
@@ -369,10 +367,6 @@ class Navigate(Task):
     return {
       "visible": float(self.seen), "centred": float(self.centred), "horizon": self.horizon
     }  # fmt: skip
-
-  def label(self, kind: str) -> str:
-    """Returns the number of the mark."""
-    return str(self.done + 1) if kind == "target" else ""
 
   def instruct(self, physics: Physics) -> str:
     """Says what is wrong with the picture, the worst first."""

@@ -110,6 +110,11 @@ class Camera:
       ],
       "sites": [_FORMS.get(int(model.site_type[s]), "ball") for s in self._sites],
       "targets": self._targets,
+      "tips": [
+        [self._bodies.index(int(model.site_bodyid[s])), *model.site_pos[s].tolist()]
+        for s in range(model.nsite)
+        if model.site(s).name.endswith("/tip") and int(model.site_bodyid[s]) in self._bodies
+      ],
       "hooks": [
         [body, *model.site_pos[s].tolist()] for body, s in zip(hooks, self._hooks, strict=True)
       ],

@@ -1,12 +1,14 @@
 // Draws a scene: tissue that moves, scenery that does not, instruments and marks. The server says where
 // things are; what a laparoscope adds to that, its lamp, wet surfaces and smoke, is made here.
 import * as THREE from "./three/three.module.min.js";
+import {Blood} from "./blood.js";
 import {unpack} from "./numbers.js";
 
 const BODY = 12, SITE = 19;  // numbers of each in a frame
 const LIP = 8e-4;  // width of the edge of a cut [m]
 const BESIDE = 0.006;  // from the lens to its lamp [m]
 const EXPERT = 0x59f2bf;
+const SHADES = 4, DARK = 0.6, SOFT = 0.006, LONG = 0.05;  // contact shadows: most, depth, reach [m], length of shaft [m]
 const PUFFS = 24;  // of smoke
 const NEAR = 0.005, FAR = 2;  // [m]
 // A scene's lights fade as MuJoCo's do, a + b d^2; `distance` and `decay` of a light carry a and b.
@@ -41,8 +43,8 @@ export class View {
 
   // What the picture depends on beside the frame.
   state() {
-    const {canvas, wire, free, turn, shift, zoom, smoke} = this;
-    const smoking = smoke?.some(puff => puff.visible) ? performance.now() : 0;
+    const {canvas, wire, free, turn, shift, zoom, smoke, blood} = this;
+    const smoking = smoke?.some(puff => puff.visible) || blood?.flows ? performance.now() : 0;
     return JSON.stringify([canvas.clientWidth, canvas.clientHeight, wire, free, turn, shift, zoom, smoking]);
   }
 
@@ -63,6 +65,8 @@ export class View {
     });
     this.papers?.forEach(paper => paper.dispose());
     this.scene = scene;
+    this.elem = this.lips = this.opened = null;
+    this.shades = {value: Array.from({length: 2 * SHADES}, () => new THREE.Vector3(9, 9, 9))};
     this.world = new THREE.Scene();
     this.world.background = new THREE.Color(0x120505);
     this.papers = new Map(Object.entries(scene.textures).map(([key, value]) => [Number(key), paper(value)]));
@@ -89,6 +93,7 @@ export class View {
       return mesh;
     });
     this.world.add(...this.parts, ...this.marks);
+    this.blood = new Blood(this.world, this.wet);
     this.weave(scene.organ);
     this.lead();
     this.smoke = Array.from({length: PUFFS}, () => {
@@ -124,12 +129,14 @@ export class View {
 
   // Takes the triangles of the organ; after a cut its own surface is drawn, for a skin knows of no cut.
   sew({triangles, outer, lips, uv}) {
-    const elem = unpack(triangles);
+    const elem = unpack(triangles), whole = this.elem;
+    const before = new Set([...this.lips ?? [], ...this.opened ?? []]);
     this.lips = unpack(lips);
     this.elem = elem.subarray(0, 3 * outer);
     this.opened = elem.subarray(3 * outer);
     const cut = this.lips.length > 0 || this.opened.length > 0;
     if (cut) this.smooth = null;
+    if (whole) this.blood.open([...this.lips, ...this.opened].filter(v => !before.has(v)));
     this.mesh.geometry.setIndex(new THREE.BufferAttribute(this.elem, 1));
     if (this.smooth) return;
     if (this.organ.geometry.index) {
@@ -164,15 +171,16 @@ export class View {
     const map = this.papers.get(texture) ?? null, metal = hard && specular > 0.85;
     if (map && repeat) map.repeat.set(...repeat);
     const common = {color, map, side, transparent: rgba[3] < 1, opacity: rgba[3]};
+    const shaded = material => hard ? material : shade(material, this.shades);
     if (!this.wet) {
       const shine = new THREE.Color(1, 1, 1).multiplyScalar(metal ? 0.9 : 0.35 * specular);
-      return new THREE.MeshPhongMaterial({...common, specular: shine, shininess: 20 + 60 * shininess});
+      return shaded(new THREE.MeshPhongMaterial({...common, specular: shine, shininess: 20 + 60 * shininess}));
     }
     const rough = {roughness: metal ? 0.3 : 0.5, metalness: metal ? 0.75 : 0};
     const film = hard ? {clearcoat: metal ? 0 : 0.4, clearcoatRoughness: 0.3} : {
       clearcoat: 0.35 + specular, clearcoatRoughness: 0.32 - 0.15 * shininess, bumpMap: map, bumpScale: 1.2,
     };
-    return new THREE.MeshPhysicalMaterial({...common, ...rough, ...film, envMap: hard ? this.mirror : null, envMapIntensity: 1});
+    return shaded(new THREE.MeshPhysicalMaterial({...common, ...rough, ...film, envMap: hard ? this.mirror : null, envMapIntensity: 1}));
   }
 
   // The eye: place, and the axes right, up, back; turned and moved in a free view.
@@ -206,6 +214,7 @@ export class View {
     camera.matrixWorldNeedsUpdate = true;
     const places = frame.length - BODY * scene.bodies - SITE * scene.sites.length, sites = places + BODY * scene.bodies;
     this.drape(frame.subarray(scene.head.length, places));
+    this.darken(frame, places);
     for (const part of this.parts) {
       pose(part.matrix, frame.subarray(places + BODY * part.userData.body));
       part.matrixWorldNeedsUpdate = true;
@@ -213,6 +222,7 @@ export class View {
     this.marks.forEach((mark, i) => place(mark, frame.subarray(sites + SITE * i, sites + SITE * (i + 1))));
     this.show(expert, head);
     this.fume(head.current > 0, frame, places);
+    this.stain();
     this.gl.render(this.world, camera);
   }
 
@@ -234,6 +244,7 @@ export class View {
     organ.visible = !wire;
     mesh.visible = wire;
     if (wire) fill(mesh.geometry, nodes, null);
+    this.nodes = nodes;
     if (smooth) {
       const out = organ.geometry.attributes.position.array, {from, nodes: near, share, count} = smooth;
       for (let i = 0; i < count; i++) {
@@ -256,6 +267,15 @@ export class View {
     if (!walls.visible) return;
     if (this.lips.length) fill(walls.geometry, ribbons(this.lips, nodes), walls.geometry.index.array);
     else fill(walls.geometry, nodes, this.opened);
+  }
+
+  // Where instruments are close to tissue, that is darker: their tips, and the shafts above them.
+  darken(frame, places) {
+    this.scene.tips.slice(0, SHADES).forEach(([body, ...at], i) => {
+      const from = pose(new THREE.Matrix4(), frame.subarray(places + BODY * body)), [tip, end] = this.shades.value.slice(2 * i);
+      tip.set(...at).applyMatrix4(from);
+      end.set(at[0], at[1], at[2] + LONG).applyMatrix4(from);
+    });
   }
 
   // The expert's way, and the instrument where the expert has it now.
@@ -286,6 +306,10 @@ export class View {
   // Smoke rises from where a hook's current acts.
   fume(burns, frame, places) {
     const now = performance.now() / 1e3, {smoke, scene} = this;
+    if (burns && scene.hooks.length) {
+      const [body, ...at] = scene.hooks[0];
+      this.blood.burn(new THREE.Vector3(...at).applyMatrix4(pose(new THREE.Matrix4(), frame.subarray(places + BODY * body))), this.nodes);
+    }
     if (burns && scene.hooks.length && now - this.blown > 0.06) {
       const [body, ...at] = scene.hooks[0], puff = smoke[this.puffed++ % PUFFS];
       const from = pose(new THREE.Matrix4(), frame.subarray(places + BODY * body));
@@ -303,6 +327,15 @@ export class View {
       puff.scale.setScalar(0.004 + 0.014 * age);
       puff.material.opacity = 0.4 * Math.max(1 - age / 1.6, 0);
     }
+  }
+
+  // Blood and char go with the vertices of the mesh; what is drawn smooth lies close to these.
+  stain() {
+    const {blood, nodes, elem} = this, {length} = nodes;
+    if (!blood.wounds.size && !blood.burns.size) return;
+    if (this.outward?.length !== length) this.outward = new Float32Array(length);
+    normals(nodes, elem, this.outward);
+    blood.draw(nodes, this.outward, elem);
   }
 
   // How far a pixel is at the tip [m].
@@ -439,6 +472,28 @@ function normals(x, t, out) {
     out[i + 1] /= size;
     out[i + 2] /= size;
   }
+}
+
+// Darkens a surface softly near the capsules of `shades`: pairs of ends, in the world.
+function shade(material, shades) {
+  material.onBeforeCompile = shader => {
+    shader.uniforms.shades = shades;
+    shader.vertexShader = `varying vec3 shadeAt;\n${shader.vertexShader}`.replace(
+      "#include <project_vertex>", "#include <project_vertex>\n\tshadeAt = (modelMatrix * vec4(transformed, 1.0)).xyz;");
+    shader.fragmentShader = `varying vec3 shadeAt;
+uniform vec3 shades[${2 * SHADES}];
+float shadeOf() {
+\tfloat near = 1.0;
+\tfor (int i = 0; i < ${SHADES}; i++) {
+\t\tvec3 along = shades[2 * i + 1] - shades[2 * i], from = shadeAt - shades[2 * i];
+\t\tfloat far = distance(from, along * clamp(dot(from, along) / max(dot(along, along), 1e-9), 0.0, 1.0)) / ${SOFT};
+\t\tnear = min(near, 1.0 - exp(-0.5 * far * far));
+\t}
+\treturn 1.0 - ${DARK} * (1.0 - near);
+}
+${shader.fragmentShader}`.replace("#include <opaque_fragment>", "outgoingLight *= shadeOf();\n\t#include <opaque_fragment>");
+  };
+  return material;
 }
 
 // Pictures and lights.
