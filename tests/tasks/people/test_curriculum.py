@@ -26,7 +26,7 @@ def test_an_exercise_opens_with_the_rule_of_proficiency():
   assert curriculum.done(met) == {"touch/easy"}
   assert curriculum.locked("touch/standard", curriculum.done(met)) is None
   assert curriculum.locked("touch/hard", curriculum.done(met)) == "touch/standard"
-  assert curriculum.following(curriculum.done(met)) == "probe/easy"
+  assert curriculum.following(curriculum.done(met)) == "navigate/easy"
   assert curriculum.locked("my/own", set()) is None
 
 
