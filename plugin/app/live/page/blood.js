@@ -2,9 +2,9 @@
 import * as THREE from "./three/three.module.min.js";
 
 const MOST = 200;  // beads and spots of char
-const VESSELS = 3;  // of so many vertices of a cut one bleeds
-const GROWS = 6, RUNS = 1.5, FAR = 5;  // of a bead [s], between one and the next below [s], at most so many
-const SIZE = 0.0016, SPOT = 0.0022;  // [m]
+const VESSELS = 4;  // of so many vertices of a cut one bleeds
+const GROWS = 6, RUNS = 1.5, FAR = 4;  // of a bead [s], between one and the next below [s], at most so many
+const SIZE = 0.0013, SPOT = 0.002;  // [m]
 const BLOOD = 0x6d0a0c, CHAR = 0x1c100c;
 
 export class Blood {
