@@ -14,7 +14,7 @@ import math
 from typing import Any
 
 import numpy as np
-from palpate.models import laparoscope
+from palpate.models import laparoscope, trocar
 from palpate.models.laparoscope import Pose
 
 from .devices.device import Device, Reading
@@ -110,7 +110,7 @@ class Scope:
 
   def _put(self, lens: np.ndarray, roll: float, deeper: float) -> None:
     """Goes to where the lens is towards a place, as deep as it was and so much deeper."""
-    pitch, yaw, _ = laparoscope.inverse(self._port, lens, check=False)
+    pitch, yaw, _ = trocar.inverse(self._port, lens, check=False)
     low, high = REACH
     self._joints = Pose(
       float(np.clip(pitch, -_WIDEST, _WIDEST)), float(np.clip(yaw, -_WIDEST, _WIDEST)),
