@@ -1,15 +1,18 @@
 """Learn an exercise from nothing: proximal policy optimisation in one file, with torch alone.
 
-    python docs/tutorials/ppo.py touch/easy                             # a GPU, 4096 worlds
+    python docs/tutorials/ppo.py grasp/easy                             # a GPU, 1024 worlds
     python docs/tutorials/ppo.py touch/easy --device cpu --worlds 32    # the same, slowly
 
-No expert and no demonstration takes part. The environment pays the change of the exercise's
-progress (docs/environments.md, "Reward"), which tells the way from anywhere in the scene. The
-algorithm is that of Schulman et al. 2017 (10.48550/arXiv.1707.06347) with generalised advantages;
-the learning rate follows the change of the policy. Episodes that the time limit ends go on in the
-critic's mind: their last reward has the value of what would have followed added to it. So have
-those that are begun anew because nothing came of them for a second or three, which keeps most
-worlds where there is something to be learned, and lets their episodes begin at different times.
+No expert and no demonstration takes part. The environment pays the change of a potential, which
+tells the way from anywhere in the scene (tasks/core/base.py, "Reward"). The algorithm is that of
+Schulman et al. 2017 (10.48550/arXiv.1707.06347) with generalised advantages; the learning rate
+follows the change of the policy. What an agent needs besides:
+
+- Jaws that are told to go a step from where they are. Noise on their position would open and close
+  them fifty times a second; so they squeeze with a force in proportion to the action.
+- Rewards of a size that a network tells from its own noise: those of an episode add up to 1.
+- Episodes that are begun anew when nothing has come of a second or three, so that most worlds are
+  where there is something to be learned. What is cut short has the critic's value added.
 """
 
 import argparse
@@ -25,10 +28,16 @@ from torch import nn  # pyright: ignore[reportMissingImports]
 
 GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.99, 0.95, 0.2, 5, 8
 KL, ENTROPY, SPREAD = 0.015, 0.001, 0.4  # change of the policy aimed at, of an iteration
-NOISE = 0.005  # advantages that are no larger tell nothing, and are not made large
-PATIENCE, GAIN = (50, 150), 0.01  # control steps without so much progress that end an episode
-DAMAGE = 2  # an outcome, see docs/vector.md
+SCALE = 10.0  # of rewards
+JAW, CLOSED, WIDE = 0.05, -0.2, 1.0472  # a step of the jaws, and where they may be told to go [rad]
+PATIENCE, GAIN = (50, 150), 0.05  # control steps without so much more paid that end an episode
 UNSEEN = ("surface",)  # 96 numbers on the whole organ, which these exercises do not need
+
+
+def network(nin: int, nout: int) -> nn.Sequential:
+  """Returns a network of two layers."""
+  layers = nn.Linear(nin, 256), nn.ELU(), nn.Linear(256, 128), nn.ELU(), nn.Linear(128, nout)
+  return nn.Sequential(*layers)
 
 
 class Agent(nn.Module):
@@ -37,7 +46,7 @@ class Agent(nn.Module):
   def __init__(self, nseen: int, naction: int):
     """Makes the networks, the policy's with actions near 0."""
     super().__init__()
-    self.mean, self.value = _network(nseen, naction), _network(nseen, 1)
+    self.mean, self.value = network(nseen, naction), network(nseen, 1)
     with torch.no_grad():
       self.mean[-1].weight.mul_(0.01)
     self.spread = nn.Parameter(torch.full((naction,), math.log(SPREAD)))
@@ -62,10 +71,30 @@ class Agent(nn.Module):
     return torch.distributions.Normal(self.mean(normal), self.spread.exp())
 
 
-def _network(nin: int, nout: int) -> nn.Sequential:
-  return nn.Sequential(
-    nn.Linear(nin, 256), nn.ELU(), nn.Linear(256, 128), nn.ELU(), nn.Linear(128, nout)
-  )
+class Worlds:
+  """An exercise in many worlds, as the agent has it."""
+
+  def __init__(self, task: str, count: int, device: str):
+    """Makes the worlds."""
+    name = f"palpate/{''.join(map(str.title, task.split('/')))}-v0"
+    self.env: Any = gymnasium.make_vec(name, num_envs=count, device=device, output="torch")
+    self.naction, self.seen = self.env.single_action_space.shape[0], {}
+
+  def reset(self, **which: Any) -> torch.Tensor:
+    """Begins episodes; returns what is seen  (nworld, nseen)."""
+    self.seen, _ = self.env.reset(**which)
+    return flat(self.seen)
+
+  def step(self, action: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Takes a control step; returns what is seen, is paid, is over, is cut short, and info."""
+    action = action.clamp(-1, 1)
+    if "gripper" in self.seen:
+      told = self.seen["gripper"][:, :1] + JAW * action[:, 4:]  # [rad]
+      share = 2 * (told - CLOSED) / (WIDE - CLOSED) - 1
+      action = torch.cat([action[:, :4], share.clamp(-1, 1)], 1)
+    self.seen, reward, terminated, truncated, info = self.env.step(action.float())
+    over, cut = (terminated | truncated).flatten(), truncated.flatten()
+    return flat(self.seen), SCALE * reward.float().flatten(), over, cut, info
 
 
 def flat(seen: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -80,9 +109,9 @@ def update(agent: Agent, adam: torch.optim.Adam, data: list[torch.Tensor]) -> No
       seen, action, before, mean, advantage, value = (each[rows] for each in data)
       policy = agent.policy(seen)
       ratio = (policy.log_prob(action).sum(1) - before).exp()
-      advantage = (advantage - advantage.mean()) / (advantage.std() + NOISE)
+      advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
       gain = torch.min(ratio * advantage, ratio.clamp(1 - CLIP, 1 + CLIP) * advantage).mean()
-      error = (agent.value(seen)[:, 0] - value).square().mean()
+      error = nn.functional.smooth_l1_loss(agent.value(seen)[:, 0], value)
       loss = error - gain - ENTROPY * policy.entropy().sum(1).mean()
       adam.zero_grad()
       loss.backward()
@@ -95,18 +124,19 @@ def update(agent: Agent, adam: torch.optim.Adam, data: list[torch.Tensor]) -> No
       adam.param_groups[0]["lr"] = min(max(rate, 5e-5), 2e-3)
 
 
-def judge(agent: Agent, env: gymnasium.vector.VectorEnv) -> float:
-  """Returns the share of successes without spread, of an episode in each world."""
-  seen, _ = env.reset(seed=1_000_000)
-  won = torch.full((env.num_envs,), -1.0, device=flat(seen).device)
-  while (won < 0).any():
+def judge(agent: Agent, worlds: Worlds, enough: float) -> float:
+  """Returns the share of worlds that succeed without spread, up to where it is clear."""
+  seen = worlds.reset(seed=1_000_000)
+  won = torch.full((len(seen),), math.nan, device=seen.device)
+  while True:
     with torch.no_grad():
-      action = agent.mean(agent.normal(flat(seen))).clamp(-1, 1)
-    seen, _, _, _, info = env.step(action)
-    if "final_info" in info:
-      over = torch.as_tensor(info["_final_info"], device=won.device) & (won < 0)
-      won[over] = info["final_info"]["success"].float().flatten()[over]
-  return float(won.mean())
+      seen, _, over, _, info = worlds.step(agent.mean(agent.normal(seen)))
+    if over.any():
+      found = info["final_info"]["success"].float().flatten()
+      won = torch.where(over & won.isnan(), found, won)
+    share = float((won == 1).float().mean())
+    if share >= enough or float((won == 0).float().mean()) > 1 - enough:
+      return share
 
 
 def main() -> None:
@@ -115,55 +145,45 @@ def main() -> None:
   add = parser.add_argument
   add("task", nargs="?", default="touch/easy")
   add("--device", default="cuda:0", help="cuda:0, cpu or warp-cpu (%(default)s)")
-  add("--worlds", type=int, default=4096)
-  add("--steps", type=int, default=32, help="of each world in an iteration (%(default)s)")
+  add("--worlds", type=int, default=1024)
+  add("--steps", type=int, default=16, help="of a world in an iteration (%(default)s)")
   add("--minutes", type=float, default=5.0)
   add("--enough", type=float, default=0.9, help="successes without spread (%(default)s)")
   add("--seed", type=int, default=0)
   add("--out", default="ppo.csv", help="curve (%(default)s)")
   args = parser.parse_args()
   torch.manual_seed(args.seed)
-  domain, level = args.task.split("/")
-  name = f"palpate/{domain.title()}{level.title()}-v0"
-  env: Any = gymnasium.make_vec(name, num_envs=args.worlds, device=args.device, output="torch")
-  seen, _ = env.reset(seed=args.seed)
-  seen = flat(seen)
-  agent = Agent(seen.shape[1], env.single_action_space.shape[0]).to(seen.device)
+  worlds = Worlds(args.task, args.worlds, args.device)
+  seen = worlds.reset(seed=args.seed)
+  agent = Agent(seen.shape[1], worlds.naction).to(seen.device)
   adam = torch.optim.Adam(agent.parameters(), lr=1e-3)
-  won, hurt, best, idle = (torch.zeros(args.worlds, device=seen.device) for _ in range(4))
+  won, earned, best, idle = (torch.zeros(args.worlds, device=seen.device) for _ in range(4))
   patience = torch.randint(*PATIENCE, (args.worlds,), device=seen.device)
   start, done, steps, iteration, judged = time.time(), False, 0, 0, math.nan
   agent.look(seen)
   with open(args.out, "w", newline="") as file:
     write = csv.writer(file)
-    names = ("success", "damage", "judged", "paid", "spread")
+    names = ("success", "judged", "progress", "most", "paid", "spread")
     write.writerow(("task", "seed", "steps", "seconds", *names))
     while not done:
       rows: list[tuple[torch.Tensor, ...]] = []
       for _ in range(args.steps):
         with torch.no_grad():
           normal = agent.normal(seen)
-          policy = agent.policy(normal)
-          action = policy.sample()
-          told, reward, terminated, truncated, info = env.step(action.clamp(-1, 1))
-          after = flat(told)
-          reward, over = reward.float().flatten(), (terminated | truncated).flatten()
-          if "final_obs" in info:  # what the episode would still have been paid
-            last = agent.value(agent.normal(flat(info["final_obs"])))[:, 0]
-            reward = reward + GAMMA * last * truncated.flatten()
-            ended = info["final_info"]
-            won = torch.where(over, ended["success"].float().flatten(), won)
-            hurt = torch.where(over, (ended["outcome"] == DAMAGE).float().flatten(), hurt)
-          chance = policy.log_prob(action).sum(1)
-          value = agent.value(normal)[:, 0]
-        progress = torch.where(over, 0.0, info["progress"].flatten())
-        idle = torch.where(over | (progress > best + GAIN), 0.0, idle + 1)
-        best = torch.where(over, 0.0, torch.where(idle > 0, best, progress))
+          policy, value = agent.policy(normal), agent.value(normal)[:, 0]
+          after, reward, over, cut, info = worlds.step(action := policy.sample())
+          earned = earned + reward
+          if over.any():
+            last = agent.normal(flat(info["final_obs"]))
+            reward = reward + GAMMA * agent.value(last)[:, 0] * cut
+            won = torch.where(over, info["final_info"]["success"].float().flatten(), won)
+        chance = policy.log_prob(action).sum(1)
         rows.append((seen, normal, action, chance, policy.mean, reward, over.float(), value))
-        seen = after
-      raw, normal, action, chance, mean, reward, over, value = map(
-        torch.stack, zip(*rows, strict=True)
-      )
+        idle = torch.where(over | (earned > best + GAIN), 0.0, idle + 1)
+        best = torch.where(idle > 0, best, earned)
+        earned, best, seen = earned * ~over, best * ~over, after
+      columns = (torch.stack(column) for column in zip(*rows, strict=True))
+      raw, normal, action, chance, mean, reward, over, value = columns
       with torch.no_grad():
         following, gain = agent.value(agent.normal(seen))[:, 0], torch.zeros_like(reward[0])
         advantage = torch.zeros_like(reward)
@@ -175,28 +195,23 @@ def main() -> None:
       if iteration:  # after the first one it knows how large observations are
         update(agent, adam, [each.flatten(0, 1) for each in data])
       agent.look(raw.flatten(0, 1))
-      stuck = idle > patience
-      if stuck.any():
-        seen = flat(env.reset(options={"reset_mask": stuck.cpu().numpy()})[0])
-        best, idle = torch.where(stuck, 0.0, best), torch.where(stuck, 0.0, idle)
-        won, hurt = torch.where(stuck, 0.0, won), torch.where(stuck, 0.0, hurt)
-      iteration, steps = iteration + 1, steps + action[..., 0].numel()
+      iteration, steps = iteration + 1, steps + over.numel()
       seconds, success = time.time() - start, float(won.mean())
+      stuck = idle > patience
       if success >= args.enough and iteration % 10 == 0:
-        judged, done = judge(agent, env), False
-        done = judged >= args.enough
-        seen = flat(env.reset(seed=args.seed + iteration)[0])
-        best, idle = torch.zeros_like(best), torch.zeros_like(idle)
-      done = done or seconds > 60 * args.minutes
-      paid, spread = float(reward.sum(0).mean()), float(agent.spread.detach().exp().mean())
-      row = (success, float(hurt.mean()), judged, paid, spread)
+        judged, stuck = judge(agent, worlds, args.enough), torch.ones_like(stuck)
+      if stuck.any():
+        seen = worlds.reset(options={"reset_mask": stuck.cpu().numpy()})
+        earned, best, idle, won = (x * ~stuck for x in (earned, best, idle, won))
+      done = judged >= args.enough or seconds > 60 * args.minutes
+      progress = info["progress"]
+      row = (success, judged, float(progress.mean()), float(progress.max()),
+             float(reward.sum(0).mean()), float(agent.spread.detach().exp().mean()))  # fmt: skip
       write.writerow((args.task, args.seed, steps, round(seconds, 1), *(f"{x:.4g}" for x in row)))
       file.flush()
       if iteration % 10 == 0 or done:
-        print(f"{args.task} seed {args.seed}: {steps:.3g} steps, {seconds:.0f} s, success "
-              f"{100 * success:.0f} %, damage {100 * row[1]:.0f} %, without spread "
-              f"{100 * judged:.0f} %, {paid:.3f} paid, "
-              f"spread {spread:.2f}", flush=True)  # fmt: skip
+        shown = ", ".join(f"{name} {x:.2f}" for name, x in zip(names, row, strict=True))
+        print(f"{args.task} {args.seed}: {steps:,} steps, {seconds:.0f} s, {shown}", flush=True)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ BENCHES = {
   "flex": "batches beside mujoco_warp's own flex on the same device",
   "flicker": "steps without force while a probe presses the organs that ship",
   "inertia": "what the effective inertia does to the contact force",
-  "learning": "SAC on touch/easy",
+  "learning": "what an agent learns of the exercises from random weights",
   "live": "how punctual a live loop is while a page shows it, and how late its pictures are",
   "locality": "what leaving out solved nodes would save",
   "loop": "the whole loop, mj_step with a probe on a windowed organ",
@@ -51,6 +51,6 @@ def main(name: str, words: Sequence[str]) -> int:
   try:
     module = importlib.import_module(f"benchmarks.{path.parent.name}.{name}")
   except ModuleNotFoundError as error:
-    text = f"{name}: {error.name} is not installed: pip install '.[bench]', for learning '.[learn]'"
+    text = f"{name}: {error.name} is not installed: pip install '.[bench]'"
     raise CommandError(text, code=1) from None
   return runner.main(module.BENCH, list(words))

@@ -92,8 +92,6 @@ def test_starting_over_keeps_the_old_rows_aside(tmp_path):
 
 @pytest.mark.parametrize("name", run.BENCHES)
 def test_every_bench_is_a_command_with_help(name, capsys):
-  if name == "learning":
-    pytest.importorskip("stable_baselines3")
   with pytest.raises(SystemExit) as end:
     command(name, "--help")
   assert end.value.code == 0

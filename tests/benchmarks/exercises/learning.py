@@ -1,190 +1,123 @@
-"""Learns `touch/easy` with Soft Actor-Critic of Stable-Baselines3, on one thread of the CPU.
+"""What an agent learns of the exercises from random weights: success over time.
 
-Mean return and success of evaluations on the way beside those of random actions, and the curve
-learning.png; needs `pip install -e '.[learn]'`.
-
-The exercise is as it comes, with its dense reward and its time limit of 10 s. What the agent adds
-are ordinary wrappers: it sees the state observations of `OBSERVATIONS`, normalised, and decides
-every 0.08 s. Training and evaluation draw their episodes from different seeds; the evaluations' are
-the same each time.
+A case is a training with docs/tutorials/ppo.py, which knows no expert, to 90 % success without
+noise in new episodes, or to the end of its minutes. `--jobs` trainings share the device: each then
+has that share of it, and what others run there comes off too.
 """
 
-import argparse
-import pathlib
-import time
+from __future__ import annotations
 
-import gymnasium
-import numpy as np
-import palpate.tasks  # registers the environments
-import torch
+import argparse
+import csv
+import pathlib
+import subprocess
+import sys
+import tempfile
+
+import palpate
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
-from gymnasium.wrappers import FilterObservation, FlattenObservation
-from stable_baselines3 import SAC
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from palpate import tasks
 
-ID = "palpate/TouchEasy-v0"
-OBSERVATIONS = (
-  "joints", "joint_vel", "drive", "tip_vel", "contact_force", "peak_force", "progress", "target",
-  "normal",
-)  # fmt: skip
-REPEAT = 4  # control steps a decision
-GAMMA = 0.98  # a horizon of 4 s
-SEEDS = 10_000  # the evaluations' episodes start here; training draws its own from --seed
-
-
-class Repeat(gymnasium.Wrapper):
-  """Repeats each action and adds up the rewards."""
-
-  def step(self, action):
-    """Takes REPEAT control steps, fewer at the end of an episode."""
-    total = 0.0
-    for _ in range(REPEAT):
-      observation, reward, terminated, truncated, info = self.env.step(action)
-      total += float(reward)
-      if terminated or truncated:
-        break
-    return observation, total, terminated, truncated, info
-
-
-def make() -> gymnasium.Env:
-  """Returns the exercise as the agent sees it."""
-  env = gymnasium.make(ID, disable_env_checker=True)
-  return FlattenObservation(FilterObservation(Repeat(env), OBSERVATIONS))
-
-
-def evaluate(act, env: gymnasium.Env, episodes: int) -> dict:
-  """Returns return, success, damage and duration of episodes; `act` maps observation to action."""
-  returns, times, outcomes = [], [], []
-  for seed in range(SEEDS, SEEDS + episodes):
-    observation, info = env.reset(seed=seed)
-    total, over = 0.0, False
-    while not over:
-      observation, reward, terminated, truncated, info = env.step(act(observation))
-      total, over = total + float(reward), terminated or truncated
-    returns.append(total)
-    times.append(env.unwrapped.environment.physics.time())
-    outcomes.append(info["outcome"])
-  return {
-    "episodes": episodes,
-    "return_mean": round(float(np.mean(returns)), 3),
-    "return_sd": round(float(np.std(returns, ddof=1)), 3),
-    "success_percent": round(100 * outcomes.count("success") / episodes, 1),
-    "damage_percent": round(100 * outcomes.count("damage") / episodes, 1),
-    "time_s_mean": round(float(np.mean(times)), 2),
-  }
-
-
-def train(args: argparse.Namespace):
-  """Yields a row for the random policy and for the agent each time it is evaluated."""
-  torch.set_num_threads(1)
-  watched, training = make(), 0.0
-  space = watched.action_space
-  space.seed(args.seed)
-
-  def row(policy: str, decisions: int, result: dict) -> dict:
-    versions = {"palpate": palpate.__version__, "seed": args.seed}
-    head = {"policy": policy, "decisions": decisions, "simulated_s": decisions * REPEAT * 0.02}
-    return head | {"training_s": round(training, 1)} | result | versions
-
-  yield row("random", 0, evaluate(lambda _: space.sample(), watched, args.episodes))
-  # Rewards add up to 1 over an episode: normalised, SAC's entropy does not drown them.
-  env = VecNormalize(DummyVecEnv([make]), gamma=GAMMA)
-  agent = SAC(
-    "MlpPolicy", env, seed=args.seed, device="cpu", gamma=GAMMA, learning_rate=1e-3,
-    learning_starts=1_000, ent_coef="auto_0.1", policy_kwargs={"net_arch": [128, 128]},
-  )  # fmt: skip
-
-  def act(observation: np.ndarray) -> np.ndarray:
-    return agent.predict(env.normalize_obs(observation), deterministic=True)[0]
-
-  yield row("SAC", 0, evaluate(act, watched, args.episodes))
-  done = 0
-  while done < args.decisions:
-    more = min(args.every, args.decisions - done)
-    before = time.perf_counter()
-    agent.learn(more, reset_num_timesteps=done == 0)
-    training += time.perf_counter() - before
-    done += more
-    yield row("SAC", done, evaluate(act, watched, args.episodes if done >= args.decisions else 20))
+SCRIPT = pathlib.Path(__file__).parents[3] / "docs" / "tutorials" / "ppo.py"
+NAMES = tuple(f"{domain}/easy" for domain in ("touch", "probe", "trace", "grasp", "retract"))
+ENOUGH = 90.0  # success that is asked for [%]
+POINTS = 30  # rows that are kept of a curve, and the last
 
 
 def arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   add = parser.add_argument
-  add("--decisions", type=int, default=15_000, help="of training (%(default)s)")
-  add("--every", type=int, default=2_500, help="decisions between evaluations (%(default)s)")
-  add("--episodes", type=int, default=50, help="of the first and last evaluation (%(default)s)")
-  add("--seed", type=int, default=0, help="of the agent and its episodes (%(default)s)")
+  names = ["/".join(pair) for pair in tasks.ALL_TASKS]
+  add("--tasks", nargs="+", metavar="TASK", choices=names, default=NAMES)
+  add("--seeds", type=int, nargs="+", default=[0, 1, 2])
+  add("--device", default="cuda:0", help="cuda:0, cpu or warp-cpu (%(default)s)")
+  add("--worlds", type=int, default=1024, help="(%(default)s)")
+  add("--most", type=float, default=5.0, help="minutes of a training (%(default)s)")
 
 
 def stages(args: argparse.Namespace) -> list[list[Case]]:
-  """Returns one case an agent."""
-  keys = {k: getattr(args, k) for k in ("decisions", "every", "episodes", "seed")}
-  return [[{"case": f"seed-{args.seed}"} | keys]]
+  """Returns a case a seed and exercise."""
+  keys = {key: getattr(args, key) for key in ("device", "worlds", "most")}
+  keys |= {"worlds": 4, "most": 0.05} if args.short else {}
+  cases = [
+    {"case": f"{task}-{seed}", "task": task, "seed": seed} | keys
+    for seed in args.seeds
+    for task in args.tasks
+  ]
+  return [cases[:1] if args.short else cases]
 
 
 def run(case: Case, out: pathlib.Path) -> list[Row]:
-  """Trains, and returns a row an evaluation."""
-  rows = []
-  for row in train(argparse.Namespace(**case)):
-    print(row["policy"], row["decisions"], row["return_mean"], flush=True)
-    rows.append(row)
-  return rows
+  """Trains, and returns rows of the curve."""
+  with tempfile.TemporaryDirectory() as folder:
+    curve = pathlib.Path(folder) / "curve.csv"
+    options = {"device": "device", "worlds": "worlds", "seed": "seed", "minutes": "most"}
+    words = [word for name, key in options.items() for word in (f"--{name}", str(case[key]))]
+    command = [sys.executable, str(SCRIPT), case["task"], *words, "--out", str(curve)]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    if ended.returncode:
+      raise RuntimeError(ended.stderr.strip().rpartition("\n")[2])
+    with open(curve, newline="", encoding="utf-8") as file:
+      found = list(csv.DictReader(file))
+  apart = max(1, len(found) // POINTS)
+  return [
+    {key: case[key] for key in ("task", "seed", "worlds")}
+    | {"steps": int(row["steps"]), "seconds": float(row["seconds"])}
+    | {key: round(100 * float(row[key]), 1) for key in ("success", "judged")}
+    | {"palpate": palpate.__version__}
+    for row in (*found[:-1:apart], found[-1])
+  ]
+
+
+def trainings(rows: list[Row]) -> dict[str, list[list[Row]]]:
+  """Returns the curves of each exercise, one a seed."""
+  out: dict[str, dict[int, list[Row]]] = {}
+  for row in (row for row in rows if row["status"] == "ok"):
+    out.setdefault(row["task"], {}).setdefault(row["seed"], []).append(row)
+  return {task: list(seeds.values()) for task, seeds in out.items()}
 
 
 def finding(rows: list[Row]) -> list[str]:
   """Returns what the page begins with."""
-  agent = [r for r in rows if r["policy"] == "SAC"]
-  first = next((r for r in agent if r["success_percent"] >= 95), None)
-  lines = [f"Random actions succeed in {rows[0]['success_percent']:.0f} % of the episodes."]
-  if first:
-    lines.append(f"SAC succeeds in {first['success_percent']:.0f} % after "
-                 f"{first['simulated_s'] / 60:.0f} minutes of practice.")  # fmt: skip
-  last = agent[-1]
-  return [*lines, f"At the end, after {last['simulated_s'] / 60:.0f} simulated minutes and "
-          f"{last['training_s'] / 60:.0f} minutes of training, it succeeds in "
-          f"{last['success_percent']:.0f} % of {last['episodes']}."]  # fmt: skip
+  ends = [curve[-1] for curves in trainings(rows).values() for curve in curves]
+  done = [end for end in ends if end["judged"] >= ENOUGH]
+  lines = [f"{len(done)} of {len(ends)} trainings reached {ENOUGH:.0f} % success."]
+  if done:
+    steps, seconds = (max(end[key] for end in done) for key in ("steps", "seconds"))
+    names = ", ".join(f"`{task}`" for task in dict.fromkeys(end["task"] for end in done))
+    lines.append(f"They took at most {steps / 1e6:.2f} million control steps and {seconds:.0f} s: "
+                 f"{names}.")  # fmt: skip
+  return lines
 
 
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
-  """Draws return and success over training."""
-  from matplotlib.figure import Figure
-
-  figure = Figure((6.4, 3.0), layout="constrained")
-  for k, (key, label) in enumerate((("return_mean", "return"), ("success_percent", "success [%]"))):
-    ax = figure.add_subplot(1, 2, k + 1)
-    agent = [r for r in rows if r["policy"] == "SAC"]
-    ax.plot([r["simulated_s"] / 60 for r in agent], [r[key] for r in agent], "o-", label="SAC")
-    ax.axhline(rows[0][key], color="#8a8f98", linestyle="--", label="random actions")
-    ax.set_xlabel("practice, simulated [min]")
-    ax.set_ylabel(label)
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.grid(color="#e4e7ec")
-  figure.axes[0].legend(loc="lower right", frameon=False)
-  path = out / "learning.png"
-  figure.savefig(path, dpi=100)
-  return [path, write(rows, about, out)]
-
-
-def write(rows: list[Row], about: dict, out: pathlib.Path) -> pathlib.Path:
-  """Writes the page and returns its path."""
+  """Draws success over control steps, and writes the page."""
+  found = trainings(rows)
+  figure, axes = plots.grid(1, max(1, len(found)), 2.4 * max(1, len(found)), 2.4)
+  for ax, (task, curves) in zip(axes, found.items(), strict=False):
+    for curve in curves:
+      ax.plot([r["steps"] / 1e6 for r in curve], [r["success"] for r in curve])
+    ax.set(title=task, xlabel="million control steps", ylim=(0, 102))
+  axes[0].set_ylabel("success, with noise [%]")
+  title = "What is learned from nothing"
+  picture = plots.save(figure, out / "learning.png", title)
   table = [
-    [r["policy"], f"{r['simulated_s']:.0f}", f"{r['training_s']:.0f}", r["episodes"],
-     f"{r['return_mean']:.2f} ± {r['return_sd']:.2f}", f"{r['success_percent']:.0f} %",
-     f"{r['damage_percent']:.0f} %"]
-    for r in rows
+    [task, end["seed"], f"{end['steps'] / 1e6:.2f}", f"{end['seconds']:.0f}",
+     f"{end['judged']:.0f} %" if end["judged"] == end["judged"] else "-", f"{end['success']:.0f} %"]
+    for task, curves in found.items()
+    for end in (curve[-1] for curve in curves)
   ]  # fmt: skip
-  head = ["policy", "simulated [s]", "training [s]", "episodes", "return", "success", "damage"]
+  head = ["exercise", "seed", "million control steps", "seconds", "success", "with noise"]
   lines = [
-    "Soft Actor-Critic of Stable-Baselines3 with the dense reward, evaluated on targets that it "
-    "has not seen, beside random actions. " + results.link(out / "learning.csv"),
+    *(__doc__ or "").split("\n\n", 1)[1].splitlines(),
+    "`success` is without noise, of an episode in each world, and at least that: counting ends with "
+    f"{ENOUGH:.0f} %. `with noise` is of the last episodes of the training. "
+    + results.link(out / "learning.csv"),
     "",
     *plots.table(head, table),
   ]
-  picture = out / "learning.png"
-  return results.page(out / "learning.md", "Learning `touch/easy`", about, lines, finding(rows),
-                      picture if picture.exists() else None)  # fmt: skip
+  return [picture, results.page(out / "learning.md", title, about, lines, finding(rows), picture)]
 
 
-BENCH = Bench("learning", stages, run, report=report, arguments=arguments)
+BENCH = Bench("learning", stages, run, report=report, arguments=arguments, jobs=1, limit=3600.0)
