@@ -14,6 +14,7 @@ import tempfile
 import threading
 
 import imageio.v3 as imageio
+import numpy as np
 
 FOLDER = pathlib.Path(__file__).with_name("pictures")
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -27,12 +28,43 @@ STATES = {
   "two_hands": (WIDE, "[data-task='bimanual/easy']", {"d": 200}, False),
   "navigate": (WIDE, "[data-task='navigate/standard']", {"s": 500, "b": 400}, False),
   "camera": (WIDE, "[data-task='grasp/easy']", {"j": 900, "n": 700}, False),
+  "cut": (WIDE, "[data-task='cut/standard']", {}, False),
   "card": (WIDE, "[data-task='touch/easy']", {"d": 300}, True),
   "practice": (WIDE, "#tab-practice", {}, False),
   "phone": (PHONE, "[data-task='trace/easy']", {"d": 200}, False),
   "phone_home": (PHONE, None, {}, False),
 }
 ANSWER = 120e3  # [ms]
+# What the page knows, and its connection, to move the hand by.
+LISTEN = """const {send} = WebSocket.prototype;
+WebSocket.prototype.send = function(words) {
+  window.program = this;
+  return send.call(this, words);
+};"""
+LOOK = """(() => {
+  const {head, scene, targets} = window.palpate();
+  return {tip: [head.tip_x, head.tip_y, head.tip_z], mat: scene.camera.mat, targets};
+})()"""
+MOVE = """move => window.program.send(JSON.stringify(
+  {type: "hand", which: "right", move, rate: [0, 0, 0, 0], buttons: []}))"""
+DEEP, HIGH = -0.004, 0.012  # of a blade over the line [m]
+CUT = 12  # marks along which it cuts
+
+
+def cut(page) -> None:
+  """Cuts along the beginning of a line, as a hand does."""
+  targets = np.array(page.evaluate(LOOK)["targets"])[:CUT, :3]
+  stations = [(targets[0], HIGH, 2e-3, 100), (targets[0], DEEP, 6e-4, 60)]
+  for place, high, step, most in stations + [(each, DEEP, 8e-4, 25) for each in targets[1:]]:
+    for _ in range(most):
+      now = page.evaluate(LOOK)
+      way = place + np.array([0, 0, high]) - now["tip"]
+      if np.linalg.norm(way) < 1.2e-3:
+        break
+      way = np.reshape(now["mat"], (3, 3)).T @ way
+      way *= min(2 * step / np.linalg.norm(way), 1)
+      page.evaluate(MOVE, [*map(float, way), 0.0])
+      page.wait_for_timeout(50)
 
 
 def draw(browser, url: str, name: str) -> None:
@@ -40,7 +72,8 @@ def draw(browser, url: str, name: str) -> None:
   (width, height), start, keys, stopped = STATES[name]
   phone = (width, height) == PHONE
   page = browser.new_page(viewport={"width": width, "height": height}, has_touch=phone)
-  page.goto(f"{url}#look=wet")
+  page.add_init_script(LISTEN)
+  page.goto(url if name == "cut" else f"{url}#look=wet")  # a hand does not wait for pictures
   page.wait_for_selector(".card", timeout=ANSWER)
   if phone:
     page.evaluate("document.body.classList.add('touch')")
@@ -52,6 +85,8 @@ def draw(browser, url: str, name: str) -> None:
       page.click("#start")
     page.wait_for_selector("#stop:enabled", timeout=ANSWER)
     page.wait_for_timeout(3000)
+  if name == "cut":
+    cut(page)
   for key, held in keys.items():
     page.focus("#view")
     page.keyboard.down(key)
