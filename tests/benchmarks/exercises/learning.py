@@ -111,7 +111,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   head = ["exercise", "seed", "million control steps", "seconds", "success", "with noise"]
   lines = [
     *(__doc__ or "").split("\n\n", 1)[1].splitlines(),
-    "`success` is without noise, of an episode in each world, and at least that: counting ends with "
+    "`success` is without noise, of an episode in each world, and at least that: counting ends at "
     f"{ENOUGH:.0f} %. `with noise` is of the last episodes of the training. "
     + results.link(out / "learning.csv"),
     "",
