@@ -102,7 +102,7 @@ def constants(
   torsion[1:-1] = config.twist * shear * 2 * second / at
   return {
     "nnode": n,
-    "twists": int(config.twist > 0),
+    "twists": int(config.twist > 0 and clamped.sum() > 1),  # else nothing holds a twist
     "shortest": float(length.min()),
     "longest": float(length.max()),
     "length": np.append(length, 0.0),

@@ -166,10 +166,15 @@ PALPATE void hold(const Fields& f, double* g, const Envelope& H) {
   }
 }
 
-// Starts from where the nodes move by themselves, as far as they do not meet.
+// Starts from where the nodes go with their last acceleration, as far as they do not meet.
 template <class Fields>
 PALPATE void predict(const Fields& f, double h) {
-  for (int a = 0; a < 3 * f.nnode; ++a) f.trial.data[a] = h * f.vel.data[a];
+  for (int i = 0; i < f.nnode; ++i) {
+    const int adr = f.dofadr.data[i];
+    D3 ahead = h * load(f.vel.data + 3 * i);
+    if (adr >= 0) ahead += h * h * load(f.qacc_warmstart.data + adr);
+    store(f.trial.data + 3 * i, ahead);
+  }
   const double part = safe_part(f, f.start.data, f.trial.data, 3);
   for (int a = 0; a < 3 * f.nnode; ++a) f.place.data[a] = f.start.data[a] + part * f.trial.data[a];
 }

@@ -98,15 +98,17 @@ template <class Fields>
 PALPATE void lay_out(const Fields& f, const double* x) {
   const int n = 4 * f.nnode;
   int* first = f.first.data;
-  for (int a = 0; a < n; ++a) first[a] = 4 * (a / 4) - 4 > 0 ? 4 * (a / 4) - 4 : 0;
-  for (int a = 8; a < n; ++a)
-    if (a % 4 < 3) first[a] = 4 * (a / 4) - 8;
+  for (int a = 0; a < n; ++a) {
+    const int node = a / 4, reach = a % 4 < 3 ? 2 : 1;
+    first[a] = node > reach ? 4 * (node - reach) : 0;
+    if (a % 4 == 3 && !f.twists) first[a] = a;
+  }
   for (int p = 0; p < f.count.data[1]; ++p) {
     const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
     const D3 off = nearest_edges(x, i, j).off;
     if (f.pressure.data[p] == 0.0 && dot(off, off) >= 4.0 * f.radius * f.radius) continue;
     for (int a = 4 * j; a < 4 * j + 7; ++a)
-      if (first[a] > 4 * i) first[a] = 4 * i;
+      if (first[a] > 4 * i && a != 4 * j + 3) first[a] = 4 * i;
   }
   int at = 0;
   for (int a = 0; a < n; ++a) {
