@@ -1,4 +1,4 @@
-"""Pictures of all worlds of a batch, by rays against triangles, on the device of the batch."""
+"""Pictures of all worlds of a batch, drawn on its device."""
 
 from .camera import Camera
 

@@ -33,11 +33,10 @@ OUTPUTS = {  # dtype of Warp, and what follows height and width
 }
 _OF_ROWS = ("lamp_pos", "lamp_dir", "ambient", "diffuse", "specular")
 MOST = 1024  # height and width [pixels]
-# Bytes that a row has for a vertex and a triangle of organs, the tree of boxes among them.
-_VERTEX, _TRIANGLE = 36.0, 200.0
-_STILL = "sah"  # how the tree of a surface is made that keeps its shape
-_BLOCK = 64  # threads of a block: rays that end sooner do not wait for many others
-_LEAF = 1  # triangles of a leaf
+_VERTEX, _TRIANGLE = 36.0, 13.0  # bytes that a row has for those of organs
+_BLOCK = 64  # threads of a block
+_SOME = 2**22  # pixels whose nearest triangles are kept at a time
+_LITTLE = 128  # pixels around a triangle that one thread of a GPU goes through alone
 _TILE = 32  # pixels that are drawn side by side
 _FINE = 128  # height of a picture from which skins are as fine as they are declared [pixels]
 
@@ -100,7 +99,7 @@ class Camera:
       wp.types.type_size_in_bytes(dtype) * int(np.prod(more))
       for dtype, more in (OUTPUTS[name] for name in outputs)
     )
-    each = size[0] * size[1] * pixel + 128.0 * (len(self.scene.things) + len(self.scene.parts))
+    each = size[0] * size[1] * pixel + 160.0 * (len(self.scene.things) + len(self.scene.parts))
     each += sum(_VERTEX * s.nvert + _TRIANGLE * len(s.face) for s in self._surfaces)
     refuse_crowd(
       len(self.worlds), each, room_of(self._device), str(self._device), "worlds to draw are"
@@ -111,6 +110,14 @@ class Camera:
     values: dict[str, Any] = {"height": size[0], "width": size[1]}
     values["world"] = wp.array(self.worlds, dtype=int, device=self._device)
     values["chosen"] = wp.full(n, True, dtype=wp.bool, device=self._device)
+    some = min(n, -(-_SOME // (size[0] * size[1])))
+    through = some * any(part.clear for part in self.scene.parts)
+    for name, rows in (("solid", some), ("clear", through)):
+      values[name] = wp.full((rows, *size), kernels.NOTHING, dtype=wp.uint64, device=self._device)
+    large = (some, kernels.LARGEST)
+    little = _LITTLE if self._device.is_cuda else MOST * MOST
+    values |= {"little": little, "nlarge": np.zeros(n, np.int32)}
+    values |= {"large": np.zeros(large, np.int32), "large_at": np.zeros((*large, 3, 3))}
     for name, (dtype, more) in OUTPUTS.items():
       shape = (n * (name in outputs), *size, *more)
       values[name] = wp.zeros(shape, dtype=dtype, device=self._device)
@@ -163,37 +170,30 @@ class Camera:
 
   def _parts(self) -> dict[str, Any]:
     parts, scene = [p for p in self.scene.parts if len(p.surface.face)], self.scene
-    self._meshes, ball, start = [], [], np.cumsum([0, *(len(p.surface.face) for p in parts)])
+    ball = []
     for part in parts:
       vert = part.surface.vert
-      self._meshes.append(
-        wp.Mesh(
-          points=wp.array(vert, dtype=wp.vec3, device=self._device),
-          indices=wp.array(part.surface.face.ravel(), dtype=int, device=self._device),
-          bvh_constructor=_STILL,
-          bvh_leaf_size=_LEAF,
-        )
-      )
       middle = 0.5 * (vert.min(axis=0) + vert.max(axis=0))
       ball.append([*middle, np.linalg.norm(vert - middle, axis=1).max()])
     self._sites = {part.site: k for k, part in enumerate(parts) if part.site >= 0}
-    n = len(parts), len(self.worlds)
+    n, count = (len(self.worlds), len(parts)), [len(p.surface.face) for p in parts]
     soft = self._surfaces
     one = [scene.density(p.surface, p.thing) for p in parts]
     one += [scene.density(each.triangles, each.thing) for each in soft]
     return dict(
       thing=np.concatenate([p.thing for p in parts] + [each.thing for each in soft]),
       dense=np.concatenate(one),
-      flat=np.concatenate([np.zeros(start[-1], int), *(each.flat for each in soft)]),
+      flat=np.concatenate([np.zeros(sum(count), int), *(each.flat for each in soft)]),
       coord=np.concatenate([p.surface.coord for p in parts] + [each.coord for each in soft]),
       corner_normal=np.concatenate([p.surface.normal for p in parts]),
-      mesh=np.array([mesh.id for mesh in self._meshes], np.uint64), start=start[:-1],
-      soft_start=int(start[-1]), part_body=self._bodies[[p.body for p in parts]].astype(np.int32),
+      corner=np.concatenate([p.surface.vert[p.surface.face] for p in parts]),
+      part=np.repeat(np.arange(len(parts), dtype=np.int32), count), soft_start=sum(count),
+      part_body=self._bodies[[p.body for p in parts]].astype(np.int32),
       part_thing=np.array([p.thing[0] if p.clear else -1 for p in parts], np.int32),
       part_mat=np.array([p.mat for p in parts]), ball=np.array(ball),
       part_pos=self._rows([p.pos for p in parts]), part_size=self._rows([p.size for p in parts]),
-      bound=np.zeros((n[1], n[0], 4)), place=np.zeros((n[1], n[0], 3)),
-      axes=np.zeros((n[1], n[0], 3, 3)),
+      axes=np.zeros((*n, 3, 3)), to_eye=np.zeros((*n, 3, 3)), from_eye=np.zeros((*n, 3)),
+      seen=np.zeros(n, np.int32),
     )  # fmt: skip
 
   def _organs(self, values: dict[str, Any]) -> dict[str, Any]:
@@ -204,10 +204,10 @@ class Camera:
       for sizes in ([s.nvert for s in self._surfaces], [len(s.face) for s in self._surfaces])
     )
     stride, count = int(nvert[-1]), int(nface[-1])
-    self._soft, self._tree = list[Any](), None
+    self._soft = list[Any]()
     if not count:
       return dict(
-        soft=0, root=np.zeros(0, np.int32), stride=0, soft_corner=np.zeros((n, 0, 3), np.int32),
+        stride=0, soft_corner=np.zeros((n, 0, 3), np.int32),
         point=np.zeros((0, 3)), normal=np.zeros((0, 3)), lips=np.zeros((n, 0), np.uint8),
         lip_thing=np.zeros(0, np.int32),
       )  # fmt: skip
@@ -223,15 +223,8 @@ class Camera:
         s.make(values["world"], int(a), int(b), shared)
         for s, a, b in zip(self._surfaces, nvert, nface, strict=False)
       ]
-      group = wp.array(np.repeat(np.arange(n), count), dtype=int)
-      how = "lbvh" if device.is_cuda else "sah"
-      self._tree = wp.Mesh(
-        points=point, indices=index, groups=group, bvh_constructor=how, bvh_leaf_size=_LEAF
-      )
-      root = wp.zeros(n, dtype=int)
-      wp.launch(kernels.find_roots, dim=n, inputs=[self._tree.id, root])
     return dict(
-      soft=self._tree.id, root=root, stride=stride, soft_corner=shared["corner"], point=point,
+      stride=stride, soft_corner=shared["corner"], point=point,
       normal=normal, lips=np.zeros((n, count), np.uint8),
       lip_thing=np.concatenate([s.lip for s in self._surfaces]),
     )  # fmt: skip
@@ -295,12 +288,13 @@ class Camera:
         soft.x = surface.tissue.xpos
         wp.launch(kernels.follow, dim=(n, surface.nvert), inputs=[soft])
         wp.launch(kernels.lift, dim=(n, surface.nvert), inputs=[soft])
-      if self._tree is not None:
-        self._tree.refit()
       wp.launch(kernels.aim, dim=n, inputs=[c])
-      wp.launch(kernels.put, dim=(n, c.mesh.shape[0]), inputs=[c])
+      wp.launch(kernels.put, dim=(n, c.part_body.shape[0]), inputs=[c])
       tiles = -(-c.width // 8) * -(-c.height // 4)
-      wp.launch(kernels.draw, dim=(n, tiles, _TILE), inputs=[c], block_dim=_BLOCK)
+      for start in range(0, n, c.solid.shape[0]):
+        some = min(c.solid.shape[0], n - start)
+        wp.launch(kernels.fill, dim=(some, c.thing.shape[0]), inputs=[c, start])
+        wp.launch(kernels.draw, dim=(some, tiles, _TILE), inputs=[c, start], block_dim=_BLOCK)
 
 
 def _lamps(m: mujoco.MjModel) -> list[dict[str, Any]]:

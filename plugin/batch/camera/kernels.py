@@ -1,9 +1,13 @@
-"""Rays from cameras: what they meet, and the light that comes back.
+"""Pictures of rows: which triangle each pixel shows, and the light that comes back from it.
 
-A row is a world that is drawn. Lamps sit beside the lens, so rays from the lens are enough: what a
-lamp does not reach the lens does not see, and there are no shadows. The light is OpenGL's fixed
-pipeline as MuJoCo sets it up (ambient, diffuse, specular, spots and attenuation; Phong's
-interpolation of normals in place of Gouraud's of colours).
+A row is a world that is drawn. `fill` enters every triangle in the pixels whose rays meet it; the
+nearest one stays. `draw` then shades each pixel once. Triangles that cover many pixels are left to
+`draw`, where all pixels of a row try them side by side.
+
+Lamps sit beside the lens, so rays from the lens are enough: what a lamp does not reach the lens
+does not see, and there are no shadows. The light is OpenGL's fixed pipeline as MuJoCo sets it up
+(ambient, diffuse, specular, spots and attenuation; Phong's interpolation of normals in place of
+Gouraud's of colours).
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -15,7 +19,10 @@ from .textures import CUBE, LEVELS
 _CUBE, _LEVELS = wp.constant(CUBE), wp.constant(LEVELS)
 _DIRECTIONAL, _SPOT = wp.constant(1), wp.constant(0)  # mjtLightType
 _OPAQUE = wp.constant(0.995)
-_PIERCE = wp.constant(8)  # back sides that a ray passes
+NOTHING = 2**64 - 1  # what a pixel has met before a picture
+_NOTHING = wp.constant(wp.uint64(NOTHING))
+LARGEST = 64  # large triangles of a row that are kept
+_LARGEST = wp.constant(LARGEST)
 SMOKE = wp.constant(0.75)  # grey of smoke
 LIP = wp.constant(8e-4)  # width of a cut's lips [m]
 
@@ -79,6 +86,7 @@ class View:
 
   height: int
   width: int
+  little: int  # pixels around a triangle from which on it is large
   near: float  # distances that are drawn [m]
   far: float
   world: ints("nrow")
@@ -101,21 +109,20 @@ class View:
   coord: Array(wp.vec3, ("nface", 3))
   corner_normal: Array(wp.vec3, ("nface", 3))
   # Parts, of bodies: a world's own place and size.
-  mesh: Array(wp.uint64, ("npart",))
-  start: ints("npart")  # first triangle
+  corner: Array(wp.vec3, ("nsolid", 3))  # of triangles in the part's frame
+  part: ints("nsolid")  # whose triangle it is
   part_body: ints("npart")
   part_thing: ints("npart")  # whose colour decides whether it is seen, -1 for several things'
   part_mat: Array(wp.mat33, ("npart",))
   ball: Array(wp.vec4, ("npart",))  # middle and radius in the part's frame
   part_pos: Array(wp.vec3, ("nrow", "npart"))
   part_size: Array(wp.vec3, ("nrow", "npart"))
-  bound: Array(wp.vec4, ("nrow", "npart"))  # middle and radius in the world; no radius, not seen
-  place: Array(wp.vec3, ("nrow", "npart"))
-  axes: Array(wp.mat33, ("nrow", "npart"))
+  axes: Array(wp.mat33, ("nrow", "npart"))  # in the world
+  seen: ints("nrow", "npart")  # 0 not in the picture, 1 opaque, 2 one may see through it
+  to_eye: Array(wp.mat33, ("nrow", "npart"))  # from its frame to the camera's
+  from_eye: Array(wp.vec3, ("nrow", "npart"))  # its place in the camera's frame
   # Organs.
-  soft: wp.uint64
-  root: ints("nrow")
-  soft_start: int
+  soft_start: int  # number of their first triangle
   stride: int
   soft_corner: ints("nrow", "nsoftface", 3)
   point: Array(wp.vec3, ("nrow * stride",))
@@ -143,6 +150,12 @@ class View:
   specular: Array(wp.vec3, ("nrow", "nlamp"))
   fade: Array(wp.vec3, ("nlamp",))
   spot: Array(wp.vec2, ("nlamp",))  # cosine of the cutoff, exponent
+  # What pixels of some rows have met: distance, as an integer's upper half, and triangle.
+  solid: Array(wp.uint64, ("nsome", "height", "width"))
+  clear: Array(wp.uint64, ("nsome", "height", "width"))  # empty where nothing lets one through
+  nlarge: ints("nrow")  # large triangles of a row, which `draw` tries in every pixel
+  large: ints("nsome", LARGEST)
+  large_at: Array(wp.mat33, ("nsome", LARGEST))  # their corners in the camera's frame
   # Pictures, empty where they are not asked for.
   pixels: Array(wp.uint8, ("nrow", "height", "width", 3))
   depth: floats("nrow", "height", "width")
@@ -159,9 +172,6 @@ class Hit:
   u: float
   v: float
   face: int  # -1 for nothing
-  part: int  # -1 for an organ
-  soft: int  # triangle among those of a row
-  normal: wp.vec3
 
 
 @wp.kernel(enable_backward=False)
@@ -170,6 +180,7 @@ def aim(c: View):
   r = wp.tid()
   if r == 0:
     c.count[0] = c.count[0] + 1
+  c.nlarge[r] = 0
   w, b = c.world[r], c.cam_body
   c.eye[r] = c.xpos[w, b] + c.xmat[w, b] * c.cam_pos[r]
   c.look[r] = c.xmat[w, b] * c.cam_mat[r]
@@ -185,48 +196,165 @@ def aim(c: View):
 
 @wp.kernel(enable_backward=False)
 def put(c: View):
-  """Finds where parts are."""
+  """Finds where parts are, and which of them are in the picture."""
   r, p = wp.tid()
   w, b = c.world[r], c.part_body[p]
-  size, ball = c.part_size[r, p], c.ball[p]
-  mat = c.xmat[w, b] * c.part_mat[p]
-  place = c.xpos[w, b] + c.xmat[w, b] * c.part_pos[r, p]
+  size, ball, inward = c.part_size[r, p], c.ball[p], wp.transpose(c.look[r])
+  axes = c.xmat[w, b] * c.part_mat[p]
+  place = inward * (c.xpos[w, b] + c.xmat[w, b] * c.part_pos[r, p] - c.eye[r])
+  mat = inward * axes * wp.diag(size)
+  c.axes[r, p] = axes
+  c.to_eye[r, p] = mat
+  c.from_eye[r, p] = place
   radius = ball[3] * wp.max(size)
-  if c.part_thing[p] >= 0 and c.rgba[r, c.part_thing[p]][3] == 0.0:
-    radius = 0.0
-  middle = place + mat * wp.cw_mul(size, wp.vec3(ball[0], ball[1], ball[2]))
-  c.place[r, p] = place
-  c.axes[r, p] = mat
-  c.bound[r, p] = wp.vec4(middle[0], middle[1], middle[2], radius)
+  m = place + mat * wp.vec3(ball[0], ball[1], ball[2])
+  up = wp.tan(0.5 * c.fovy[r])
+  across = up * float(c.width) / float(c.height)
+  seen = wp.int32(1)
+  if c.part_thing[p] >= 0:
+    alpha = c.rgba[r, c.part_thing[p]][3]
+    if alpha == 0.0:
+      seen = 0
+    elif alpha < _OPAQUE:
+      seen = 2
+  if -m[2] + radius < c.near or -m[2] - radius > c.far:
+    seen = 0
+  if wp.abs(m[0]) + across * m[2] > radius * wp.sqrt(1.0 + across * across):
+    seen = 0
+  if wp.abs(m[1]) + up * m[2] > radius * wp.sqrt(1.0 + up * up):
+    seen = 0
+  c.seen[r, p] = seen
 
 
 @wp.func
-def nothing(far: float):
-  """Returns the hit of a ray that meets nothing so far away."""
+def nothing():
+  """Returns the hit of a ray that meets nothing."""
   hit = Hit()
-  hit.t = far
   hit.face = -1
-  hit.part = -1
   return hit
 
 
 @wp.func
-def cast(mesh: wp.uint64, root: int, o: wp.vec3, d: wp.vec3, before: Hit):
-  """Meets the front of a mesh nearer than a hit; back sides are not seen."""
-  hit = before
-  start, passed = wp.float32(0.0), wp.int32(0)
-  while passed < _PIERCE:  # a loop that is not unrolled
-    q = wp.mesh_query_ray(mesh, o + start * d, d, before.t - start, root)
-    passed += 1
-    if q.result and q.sign > 0.0:
-      hit.t = start + q.t
-      hit.u = q.u
-      hit.v = q.v
-      hit.normal = q.normal
-      hit.face = q.face
-    if not q.result or q.sign > 0.0:
-      passed = _PIERCE
-    start += q.t * (1.0 + 1e-5) + 1e-7
+def corners(c: View, r: int, f: int):
+  """Returns the corners of a triangle in the camera's frame, as rows."""
+  if f < c.soft_start:
+    p = c.part[f]
+    mat, place = c.to_eye[r, p], c.from_eye[r, p]
+    return wp.matrix_from_rows(
+      place + mat * c.corner[f, 0], place + mat * c.corner[f, 1], place + mat * c.corner[f, 2]
+    )
+  inward, eye, k = wp.transpose(c.look[r]), c.eye[r], f - c.soft_start
+  return wp.matrix_from_rows(
+    inward * (c.point[c.soft_corner[r, k, 0]] - eye),
+    inward * (c.point[c.soft_corner[r, k, 1]] - eye),
+    inward * (c.point[c.soft_corner[r, k, 2]] - eye),
+  )
+
+
+@wp.func
+def ray_of(c: View, pixel: float, i: int, j: int):
+  """Returns x and y of a pixel's ray at the distance 1, where a pixel has that size."""
+  return wp.vec2(
+    (float(j) + 0.5 - 0.5 * float(c.width)) * pixel,
+    (0.5 * float(c.height) - float(i) - 0.5) * pixel,
+  )
+
+
+@wp.func
+def shares(m: wp.mat33, at: wp.vec2):
+  """Returns what the corners of a triangle weigh where a ray meets its plane; none is < 0 inside.
+
+  The ray goes through (x, y, -1) in the camera's frame. Corners are sheared so that it becomes an
+  axis (Woop, Benthin and Wald 2013, "Watertight ray/triangle intersection").
+  """
+  x, y = at[0], at[1]
+  ax, ay = m[0, 0] + x * m[0, 2], m[0, 1] + y * m[0, 2]
+  bx, by = m[1, 0] + x * m[1, 2], m[1, 1] + y * m[1, 2]
+  ex, ey = m[2, 0] + x * m[2, 2], m[2, 1] + y * m[2, 2]
+  return wp.vec3(bx * ey - by * ex, ex * ay - ey * ax, ax * by - ay * bx)
+
+
+@wp.func
+def distance(m: wp.mat33, share: wp.vec3):
+  """Returns how far from the camera's plane such a place is."""
+  across = share[0] * m[0, 2] + share[1] * m[1, 2] + share[2] * m[2, 2]
+  return -across / (share[0] + share[1] + share[2])
+
+
+@wp.func
+def key_at(c: View, m: wp.mat33, f: int, at: wp.vec2):
+  """Returns what a pixel's ray has met on a triangle: the nearest one is the least."""
+  share = shares(m, at)
+  if share[0] < 0.0 or share[1] < 0.0 or share[2] < 0.0 or wp.max(share) == 0.0:
+    return _NOTHING
+  t = distance(m, share)
+  if t <= c.near or t >= c.far:
+    return _NOTHING
+  return (wp.uint64(wp.cast(t, wp.uint32)) << wp.uint64(32)) | wp.uint64(f)
+
+
+@wp.kernel(enable_backward=False)
+def fill(c: View, first: int):
+  """Enters a triangle in the pixels that it covers; those that face away are not seen."""
+  row, f = wp.tid()
+  r = first + row
+  if not c.chosen[r]:
+    return
+  clear = False
+  if f < c.soft_start:
+    seen = c.seen[r, c.part[f]]
+    if seen == 0:
+      return
+    clear = seen == 2
+  m = corners(c, r, f)
+  a, b, e = m[0], m[1], m[2]
+  if wp.dot(a, wp.cross(b - a, e - a)) >= 0.0:
+    return
+  if wp.max(wp.vec3(-a[2], -b[2], -e[2])) <= c.near:
+    return
+  i0, i1, j0, j1 = wp.int32(0), c.height - 1, wp.int32(0), c.width - 1
+  pixel = 2.0 * wp.tan(0.5 * c.fovy[r]) / float(c.height)
+  half_w, half_h = 0.5 * float(c.width), 0.5 * float(c.height)
+  if wp.min(wp.vec3(-a[2], -b[2], -e[2])) > 0.5 * c.near:
+    x = wp.vec3(-a[0] / a[2], -b[0] / b[2], -e[0] / e[2]) / pixel
+    y = wp.vec3(a[1] / a[2], b[1] / b[2], e[1] / e[2]) / pixel
+    j0 = int(wp.ceil(wp.max(wp.min(x), -half_w) + half_w - 0.501))
+    j1 = int(wp.floor(wp.min(wp.max(x), half_w) + half_w - 0.499))
+    i0 = int(wp.ceil(wp.max(wp.min(y), -half_h) + half_h - 0.501))
+    i1 = int(wp.floor(wp.min(wp.max(y), half_h) + half_h - 0.499))
+    i0, j0 = wp.max(i0, 0), wp.max(j0, 0)
+    i1, j1 = wp.min(i1, c.height - 1), wp.min(j1, c.width - 1)
+  if i0 > i1 or j0 > j1:
+    return
+  if (i1 - i0 + 1) * (j1 - j0 + 1) > c.little and not clear:
+    k = wp.atomic_add(c.nlarge, r, 1)
+    if k < _LARGEST:
+      c.large[row, k] = f
+      c.large_at[row, k] = m
+      return
+  for i in range(i0, i1 + 1):
+    for j in range(j0, j1 + 1):
+      key = key_at(c, m, f, ray_of(c, pixel, i, j))
+      if key != _NOTHING:
+        if clear:
+          wp.atomic_min(c.clear, row, i, j, key)
+        else:
+          wp.atomic_min(c.solid, row, i, j, key)
+
+
+@wp.func
+def met(c: View, r: int, key: wp.uint64, at: wp.vec2):
+  """Returns the hit that a pixel has met."""
+  if key == _NOTHING:
+    return nothing()
+  hit = Hit()
+  hit.face = int(key & wp.uint64(0xFFFFFFFF))
+  m = corners(c, r, hit.face)
+  share = shares(m, at)
+  total = share[0] + share[1] + share[2]
+  hit.t = distance(m, share)
+  hit.u = share[0] / total
+  hit.v = share[1] / total
   return hit
 
 
@@ -316,9 +444,10 @@ def thing_of(c: View, r: int, hit: Hit):
   """Returns the thing that a ray has met, -1 for none."""
   if hit.face < 0:
     return -1
-  if hit.part < 0:
-    if on_lip(c, r, hit.soft, hit):
-      return c.lip_thing[hit.soft]
+  if hit.face >= c.soft_start:
+    k = hit.face - c.soft_start
+    if on_lip(c, r, k, hit):
+      return c.lip_thing[k]
   return c.thing[hit.face]
 
 
@@ -327,14 +456,15 @@ def normal_of(c: View, r: int, hit: Hit):
   """Returns the unit normal where a ray has met a surface."""
   u, v, w = hit.u, hit.v, 1.0 - hit.u - hit.v
   f = hit.face
-  if hit.part >= 0:
+  if f < c.soft_start:
     n = c.corner_normal[f, 0] * u + c.corner_normal[f, 1] * v + c.corner_normal[f, 2] * w
-    return wp.normalize(c.axes[r, hit.part] * wp.cw_div(n, c.part_size[r, hit.part]))
+    p = c.part[f]
+    return wp.normalize(c.axes[r, p] * wp.cw_div(n, c.part_size[r, p]))
+  k = f - c.soft_start
+  i, j, l = c.soft_corner[r, k, 0], c.soft_corner[r, k, 1], c.soft_corner[r, k, 2]
   if c.flat[f] != 0:
-    return wp.normalize(hit.normal)
-  i, j, l = (
-    c.soft_corner[r, hit.soft, 0], c.soft_corner[r, hit.soft, 1], c.soft_corner[r, hit.soft, 2]
-  )
+    a = c.point[i]
+    return wp.normalize(wp.cross(c.point[j] - a, c.point[l] - a))
   return wp.normalize(c.normal[i] * u + c.normal[j] * v + c.normal[l] * w)
 
 
@@ -381,80 +511,42 @@ def shade(c: View, r: int, o: wp.vec3, d: wp.vec3, pixel: float, hit: Hit):
   return out
 
 
-@wp.func
-def meet(c: View, r: int, o: wp.vec3, d: wp.vec3):
-  """Returns what a ray meets first, and what it meets first that it may pass through.
-
-  Organs come first, then parts: one place in the code casts rays, which keeps it short.
-  """
-  solid, clear = nothing(c.far - c.near), nothing(c.far - c.near)
-  length2 = wp.dot(d, d)
-  for k in range(-1, c.mesh.shape[0]):
-    mesh, root, alpha = wp.uint64(c.soft), wp.int32(-1), wp.float32(1.0)
-    own, way = wp.vec3(o), wp.vec3(d)
-    if k < 0:
-      if c.soft != wp.uint64(0):
-        root = c.root[r]
-    else:
-      bound = c.bound[r, k]
-      to = wp.vec3(bound[0], bound[1], bound[2]) - o
-      along = wp.dot(to, d)
-      reach = bound[3] * bound[3]
-      mesh = wp.uint64(0)
-      if reach > 0.0 and wp.dot(to, to) * length2 - along * along <= reach * length2:
-        mesh = c.mesh[k]
-        size, turn = c.part_size[r, k], wp.transpose(c.axes[r, k])
-        own, way = wp.cw_div(turn * (o - c.place[r, k]), size), wp.cw_div(turn * d, size)
-        if c.part_thing[k] >= 0:
-          alpha = c.rgba[r, c.part_thing[k]][3]
-    if mesh != wp.uint64(0):
-      before = solid
-      if alpha < _OPAQUE:
-        before = clear
-      hit = cast(mesh, root, own, way, before)
-      if hit.t < before.t:
-        hit.part = k
-        if k < 0:
-          hit.soft = hit.face - r * c.soft_corner.shape[1]
-          hit.face = c.soft_start + hit.soft
-        else:
-          hit.face = c.start[k] + hit.face
-        if alpha < _OPAQUE:
-          clear = hit
-        else:
-          solid = hit
-  if clear.t >= solid.t:
-    clear.face = -1
-  return solid, clear
-
-
 @wp.kernel(enable_backward=False)
-def draw(c: View):
+def draw(c: View, start: int):
   """Draws a pixel of a row; 32 neighbours in 8 columns and 4 lines are near in time."""
-  r, tile, k = wp.tid()
+  row, tile, k = wp.tid()
+  r = start + row
   across = (c.width + 7) / 8
   i, j = tile / across * 4 + k / 8, tile % across * 8 + k % 8
   if i >= c.height or j >= c.width or not c.chosen[r]:
     return
   pixel = 2.0 * wp.tan(0.5 * c.fovy[r]) / float(c.height)
-  x = (float(j) + 0.5 - 0.5 * float(c.width)) * pixel
-  y = (0.5 * float(c.height) - float(i) - 0.5) * pixel
-  d = c.look[r] * wp.vec3(x, y, -1.0)  # a distance along it is one from the camera's plane
-  o = c.eye[r] + c.near * d
-  solid, clear = meet(c, r, o, d)
+  at = ray_of(c, pixel, i, j)
+  d = c.look[r] * wp.vec3(at[0], at[1], -1.0)  # a distance along it is one from the camera's plane
+  o = c.eye[r]
+  nearest = c.solid[row, i, j]
+  c.solid[row, i, j] = _NOTHING
+  for l in range(wp.min(c.nlarge[r], _LARGEST)):
+    nearest = wp.min(nearest, key_at(c, c.large_at[row, l], c.large[row, l], at))
+  solid, clear = met(c, r, nearest, at), nothing()
+  if c.clear.shape[0] > 0:
+    key = c.clear[row, i, j]
+    if key < nearest:
+      clear = met(c, r, key, at)
+    c.clear[row, i, j] = _NOTHING
   first = solid
   if clear.face >= 0:
     first = clear
   seen = thing_of(c, r, first)
   z = c.far
   if first.face >= 0:
-    z = c.near + first.t
+    z = first.t
   if c.depth.shape[0] > 0:
     c.depth[r, i, j] = z
   if c.points.shape[0] > 0:
     c.points[r, i, j] = wp.vec3()
     if first.face >= 0:
-      c.points[r, i, j] = wp.vec3(z * x, -z * y, z)
+      c.points[r, i, j] = wp.vec3(z * at[0], -z * at[1], z)
   if c.segmentation.shape[0] > 0:
     c.segmentation[r, i, j] = wp.vec2i(-1, -1)
     if first.face >= 0:
@@ -472,7 +564,7 @@ def draw(c: View):
       if hit.face >= 0:
         through = wp.float32(0.0)
         if left == 1:  # MuJoCo draws it twice
-          through = 1.0 - c.rgba[r, c.part_thing[clear.part]][3]
+          through = 1.0 - c.rgba[r, c.thing[clear.face]][3]
         out = through * through * out + (1.0 - through * through) * shade(c, r, o, d, pixel, hit)
       hit = clear
       left -= 1
@@ -484,9 +576,3 @@ def draw(c: View):
     for l in range(3):
       c.pixels[r, i, j, l] = wp.uint8(wp.clamp(255.0 * out[l] + 0.5, 0.0, 255.0))
 
-
-@wp.kernel(enable_backward=False)
-def find_roots(mesh: wp.uint64, root: wp.array[int]):
-  """Finds where the triangles of each row are in the tree of all."""
-  r = wp.tid()
-  root[r] = wp.mesh_get_group_root(mesh, r)
