@@ -175,6 +175,30 @@ def dress(spec: mujoco.MjSpec, organ: str, kind: str, uv: np.ndarray, look: int 
   flex.texcoord, flex.elemtexcoord = np.ravel(uv), flex.elem
 
 
+def vary(spec: mujoco.MjSpec, organ: str, count: int):
+  """Gives an organ's skin and surface further materials, each with a texture of another seed.
+
+  Number k is called as the organ's own material, `_k` behind it; k = 0 is that itself.
+
+  Args:
+    spec: changed in place
+    organ: name of the flexcomp
+    count: of textures
+  """
+  skins_ = [skin.material for skin in spec.skins if skin.name.startswith(organ)]
+  for name in dict.fromkeys([spec.flex(organ).material, *skins_]):
+    made = spec.material(name) if name else None
+    if made is None:
+      continue
+    paper = made.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]
+    for k in range(1, count) if paper else ():
+      twin = spec.add_material(
+        name=f"{name}_{k}", rgba=made.rgba, specular=made.specular, shininess=made.shininess
+      )
+      _hang(spec, twin, paper.removeprefix("abdomen_"), k, f"{paper}_{k}")
+      twin.texrepeat = made.texrepeat
+
+
 def surround(
   spec: mujoco.MjSpec,
   organ: str,
@@ -420,21 +444,25 @@ def _material(spec, name: str, rgba, kind: str | None, look: int, repeat: float 
   )
   made.texrepeat = [repeat, repeat]
   if kind is not None:
-    paper = f"abdomen_{kind}"
-    if spec.texture(paper) is None:
-      pixels = texture.texture(kind, look)
-      spec.add_texture(
-        name=paper,
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        width=pixels.shape[1],
-        height=pixels.shape[0],
-        nchannel=3,
-        data=pixels.ravel(),
-      )
-    roles = list(made.textures)
-    roles[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = paper
-    made.textures = roles
+    _hang(spec, made, kind, look, f"abdomen_{kind}")
   return name
+
+
+def _hang(spec: mujoco.MjSpec, material: mujoco.MjsMaterial, kind: str, look: int, name: str):
+  """Gives a material a texture, made unless the spec has it."""
+  if spec.texture(name) is None:
+    pixels = texture.texture(kind, look)
+    spec.add_texture(
+      name=name,
+      type=mujoco.mjtTexture.mjTEXTURE_2D,
+      width=pixels.shape[1],
+      height=pixels.shape[0],
+      nchannel=3,
+      data=pixels.ravel(),
+    )
+  roles = list(material.textures)
+  roles[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = name
+  material.textures = roles
 
 
 def draw(spec: mujoco.MjSpec, name: str, surface: Surface, material: str, pos=(0, 0, 0)) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import mujoco as mj
 import numpy as np
+from palpate import lens
 from palpate.models import laparoscope, trocar
 from palpate.tasks.core import randomisation
 from palpate.tasks.core.base import Task
@@ -149,7 +150,8 @@ class Episodes:
       own = body.pos.copy(), body.quat.copy(), hand.pose
       frame |= dict(zip(rows_of(which), own, strict=True))
     if self.look and self._task.ranges:
-      frame["look_film"] = np.array(randomisation.film(self._task.drawn))
+      if randomisation.through(self._task.ranges):
+        frame |= {f"look_{k}": v for k, v in lens.lens(self._task.drawn).items()}
       frame |= {f"look_{k}": v for k, v in self.look(model).items()}
       frame |= {f"drawn_{k}": np.array(v) for k, v in self._task.drawn.items()}
     mj.mj_camlight(model, self.physics.data.ptr)

@@ -11,12 +11,10 @@ import mujoco as mj
 import numpy as np
 import warp as wp
 from palpate.batch.camera import Camera
-from palpate.tasks.core import observation, scenes
+from palpate.tasks.core import observation, randomisation, scenes
 from palpate.tissue.types import fill
 
 from .marks import Films, Marks, film, marking
-
-_OUTPUT = {"segmentation": "labels"}  # of the camera, where that is called otherwise
 
 
 class Pictures:
@@ -41,11 +39,19 @@ class Pictures:
   ):
     task, physics, batch = worlds.task, worlds.episodes.physics, worlds.batch
     self._worlds, self._all = worlds, chosen is None
-    outputs = [_OUTPUT.get(name, name) for name in names]
-    labels = observation.labels(physics)
-    self._camera = Camera(batch, scenes.CAMERA, *size, outputs, chosen, labels)
+    seen = {name: observation.PICTURES[name] for name in names}
+    eyes = sorted({picture.eye for picture in seen.values()})
+    outputs = list(dict.fromkeys(picture.of for picture in seen.values()))
+    every = [*range(batch.nworld)] if chosen is None else [*chosen]
+    self._count, n = len(eyes), len(every)
+    self._camera = Camera(
+      batch, scenes.CAMERA, *size, outputs, every * self._count, observation.labels(physics),
+      np.repeat(eyes, n).tolist(), randomisation.through(task.ranges),
+    )  # fmt: skip
     found = self._camera.pictures
-    self.arrays = {name: found[_OUTPUT.get(name, name)] for name in names}
+    self.arrays = {
+      name: found[picture.of][eyes.index(picture.eye) * n :][:n] for name, picture in seen.items()
+    }
     view, site = self._camera.view, int(mj.mjtObj.mjOBJ_SITE)
     own = {"world": view.world, "pos": view.part_pos, "rgba": view.rgba}
     parts = [self._camera.part(k) for k in physics.target_sites]
@@ -66,8 +72,12 @@ class Pictures:
 
   def show(self, worlds: np.ndarray, rows: Mapping[str, np.ndarray]):
     """Gives the camera of worlds what was drawn for their episodes, see `Episodes`."""
-    own = {name: value[worlds] for name, value in rows.items() if name.startswith("look_")}
-    self._camera.show(worlds, {name.removeprefix("look_"): value for name, value in own.items()})
+    first = np.arange(self._count)[:, None] * (len(self._camera.worlds) // self._count)
+    own = {
+      name.removeprefix("look_"): np.tile(value[worlds], (self._count, *[1] * (value.ndim - 1)))
+      for name, value in rows.items() if name.startswith("look_")
+    }  # fmt: skip
+    self._camera.show((first + worlds).ravel(), own)
 
   def draw(self, mask: wp.array | None = None):
     """Draws all worlds, or those of a mask on the device."""

@@ -67,7 +67,7 @@ class Worlds:
     stage = task.compiled(task.variants[0])
     with warnings.catch_warnings():  # the plugin's passive forces are unknown to the compiler
       warnings.filterwarnings("ignore", ".*has no equality constraints or passive forces")
-      scene = task.spec(task.variants[0])
+      scene = task.dressed(task.variants[0])
       self.batch = palpate.batch.make(scene, nworld, device, **options)
     self.device, self._substeps = self.batch.device, episode.substeps(environment)
     self.batch.start(at_rest(self.batch.model, stage.state, STATE))

@@ -47,7 +47,7 @@ from typing import Any
 import mujoco as mj
 import numpy as np
 from dm_env import specs
-from palpate.models import trocar
+from palpate.models import situs, trocar
 
 from ..recorder import together
 from ..recording import Event, Settings
@@ -197,8 +197,15 @@ class Task(engine.Task):
   def compiled(self, variant: int | None) -> Stage:
     """Returns the stage of a shape."""
     if variant not in self._models:
-      self._models[variant] = self._stage(self.spec(variant))
+      self._models[variant] = self._stage(self.dressed(variant))
     return self._models[variant]
+
+  def dressed(self, variant: int | None) -> mj.MjSpec:
+    """Returns the scene of a shape, with as many textures of the organ as `randomise` asks for."""
+    spec = self.spec(variant)
+    if "texture" in self.ranges:
+      situs.vary(spec, self.organ, randomisation.TEXTURES)
+    return spec
 
   def spec(self, variant: int | None) -> mj.MjSpec:
     """Returns the scene of a shape, not that of `model`."""

@@ -10,6 +10,7 @@ drawn when they are chosen. docs/environments.md has every name.
 import collections
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -25,6 +26,7 @@ from .scenes import CAMERA
 
 GROUPS = ("sensors", "state")
 SIZE = (84, 84)  # of pictures, height and width [pixels]
+BASE = 0.005  # between the lenses of a stereo laparoscope [m]
 LABELS = {"organ": 1, "instrument": 2, "target": 3}  # of `segmentation`, 0 is anything else
 _MOST = 4096  # [pixels]
 
@@ -166,6 +168,10 @@ def _segmentation(camera: Camera, physics: Physics) -> np.ndarray:
   return out
 
 
+def _soiling(camera: Camera, physics: Physics) -> np.ndarray:
+  return np.zeros((*camera.render().shape[:2], 2), np.uint8)  # what a lens adds comes later
+
+
 @dataclasses.dataclass(frozen=True)
 class Picture:
   """What the laparoscope sees.
@@ -178,6 +184,8 @@ class Picture:
     low: least value
     high: greatest value
     draw: takes camera and physics, returns it
+    of: what a camera of a batch calls it, see `palpate.lens`
+    eye: how far the lens is to the right of the laparoscope's [m]
   """
 
   unit: str
@@ -187,10 +195,19 @@ class Picture:
   low: float
   high: float
   draw: Callable[[Camera, Physics], np.ndarray]
+  of: str
+  eye: float = 0.0
+
+
+def _stereo(side: str, eye: float) -> Picture:
+  what = f"what a lens {1000 * BASE / 2:g} mm to the {side} sees: red, green, blue"
+  return Picture("-", what, np.uint8, (3,), 0, 255, _pixels, "pixels", eye)
 
 
 PICTURES = {
-  "pixels": Picture("-", "red, green, blue", np.uint8, (3,), 0, 255, _pixels),
+  "pixels": Picture("-", "red, green, blue", np.uint8, (3,), 0, 255, _pixels, "pixels"),
+  "pixels_left": _stereo("left", -BASE / 2),
+  "pixels_right": _stereo("right", BASE / 2),
   "depth": Picture(
     "m",
     "distance from the camera's plane, the far plane's where nothing is",
@@ -199,6 +216,7 @@ PICTURES = {
     0,
     np.inf,
     _depth,
+    "depth",
   ),
   "segmentation": Picture(
     "-",
@@ -208,6 +226,7 @@ PICTURES = {
     0,
     max(LABELS.values()),
     _segmentation,
+    "labels",
   ),
   "points": Picture(
     "m",
@@ -217,6 +236,17 @@ PICTURES = {
     -np.inf,
     np.inf,
     _points,
+    "points",
+  ),
+  "soiling": Picture(
+    "-",
+    "share of smoke, and of blood on the lens, before a pixel, of 255; see `randomise`",
+    np.uint8,
+    (2,),
+    0,
+    255,
+    _soiling,
+    "soiling",
   ),
 }
 
@@ -290,15 +320,24 @@ def check(task: Any, physics: Physics) -> None:
 def take(task: Any, physics: Physics) -> collections.OrderedDict:
   """Returns what a task observes."""
   out = _numbers(task, physics)
-  names = task.observed.pictures
+  numbers, names = [*out], task.observed.pictures
   if names:
     height, width = task.observed.size
-    camera = Camera(physics, height, width, physics.model.ptr.camera(CAMERA).id)
-    for name in names:
-      out[name] = PICTURES[name].draw(camera, physics)
+    model, place = physics.model.ptr, physics.data.ptr.cam_xpos
+    number = model.camera(CAMERA).id
+    camera, middle = Camera(physics, height, width, number), place[number].copy()
+    fovy, right = math.radians(model.cam_fovy[number]), physics.camera()[1][:, 0]
+    for eye in sorted({PICTURES[name].eye for name in names}):
+      own = [name for name in names if PICTURES[name].eye == eye]
+      place[number] = middle + eye * right
+      seen = {PICTURES[name].of: PICTURES[name].draw(camera, physics) for name in own}
+      if randomisation.through(task.ranges):
+        seed = round(1e4 * physics.time()) + round(1e6 * eye)
+        seen = randomisation.see(seen, task.drawn, fovy, far(physics), seed)
+      out |= {name: seen[PICTURES[name].of] for name in own}
+    place[number] = middle
     camera.scene.free()
-    if "pixels" in out:
-      out["pixels"] = randomisation.develop(out["pixels"], task.drawn, physics.time())
+    out = collections.OrderedDict((name, out[name]) for name in [*numbers, *names])
   return out
 
 

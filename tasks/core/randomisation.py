@@ -15,12 +15,16 @@ from typing import Any
 
 import mujoco as mj
 import numpy as np
+import warp as wp
+from palpate import lens
+from palpate.lens import DROPS
+from palpate.tissue.types import fill
 
 from . import stage
 from .physics import Physics
 from .scenes import CAMERA, LIGHT
 
-SMOKE = 0.75  # its grey
+TEXTURES = 16  # of an organ
 Ranges = Mapping[str, tuple[float, float]]
 
 
@@ -88,8 +92,17 @@ def _fovy(physics: Physics, place: stage.Stage, change: np.ndarray) -> None:
   place.model.cam_fovy[place.model.camera(CAMERA).id] += change[0]
 
 
-def _developed(physics: Physics, place: stage.Stage, value: np.ndarray) -> None:
-  """Leaves the scene: `develop` changes the pictures."""
+def _of_lens(physics: Physics, place: stage.Stage, value: np.ndarray) -> None:
+  """Leaves the scene: `see` changes the pictures."""
+
+
+def _texture(physics: Physics, place: stage.Stage, value: np.ndarray) -> None:
+  model, k = place.model, min(int(value[0]), TEXTURES - 1)
+  for of in (model.flex_matid, model.skin_matid) if k else ():
+    for owner, material in enumerate(of):
+      name = f"{mj.mj_id2name(model, mj.mjtObj.mjOBJ_MATERIAL, material)}_{k}"
+      found = mj.mj_name2id(model, mj.mjtObj.mjOBJ_MATERIAL, name)
+      of[owner] = found if found >= 0 else material
 
 
 def _colour(physics: Physics, place: stage.Stage, change: np.ndarray) -> None:
@@ -125,14 +138,30 @@ QUANTITIES = {
   "light_pos": Quantity(
     "shift of the lights along each axis", "m", -0.2, 0.2, 3, _light_pos
   ),
+  "texture": Quantity(
+    f"number of the organ's texture, rounded down, one of {TEXTURES}; in the abdomen", "-", 0.0,
+    float(TEXTURES), 1, _texture,
+  ),
   "colour": Quantity(
     "change of the organ's red, green and blue, which are in [0, 1]", "-", -1.0, 1.0, 3, _colour
   ),
-  "veil": Quantity("share of light grey smoke in `pixels`", "-", 0.0, 1.0, 1, _developed),
-  "exposure": Quantity("factor on `pixels`, after the smoke", "-", 0.0, 5.0, 1, _developed),
+  "lens_k1": Quantity(
+    "distortion of the lens by Brown and Conrady, k1 as in OpenCV; below 0 it is a barrel. What is "
+    "beyond the scene's picture is black", "-", -0.5, 0.5, 1, _of_lens,
+  ),
+  "lens_k2": Quantity("the same, k2", "-", -0.5, 0.5, 1, _of_lens),
+  "blur": Quantity(
+    "way of the picture during an exposure, right and down", "heights", -0.2, 0.2, 2, _of_lens
+  ),
+  "veil": Quantity("share of light grey smoke in `pixels`", "-", 0.0, 1.0, 1, _of_lens),
+  "blood": Quantity(
+    "number of blood drops on the lens, rounded down; its digits say where they are", "-", 0.0,
+    float(DROPS), 1, _of_lens,
+  ),
+  "exposure": Quantity("factor on `pixels`, after smoke and blood", "-", 0.0, 5.0, 1, _of_lens),
   "noise": Quantity(
     "standard deviation of noise on `pixels`, of 1, another in each picture", "-", 0.0, 0.5, 1,
-    _developed,
+    _of_lens,
   ),
 }  # fmt: skip
 
@@ -180,27 +209,34 @@ def apply(
   return drawn
 
 
-def film(drawn: Mapping[str, Any]) -> tuple[float, float, float]:
-  """Returns veil, exposure and noise of what was drawn."""
-  return drawn.get("veil", 0.0), drawn.get("exposure", 1.0), drawn.get("noise", 0.0)
+def through(ranges: Ranges) -> bool:
+  """Returns whether pictures are seen through a lens that is not perfect."""
+  return any(QUANTITIES[name].apply is _of_lens for name in ranges)
 
 
-def develop(pixels: np.ndarray, drawn: Mapping[str, Any], time: float) -> np.ndarray:
-  """Returns a picture as lens and sensor make it, of what the scene sends there.
+def see(
+  pictures: Mapping[str, np.ndarray], drawn: Mapping[str, Any], fovy: float, far: float, seed: int
+) -> dict[str, np.ndarray]:
+  """Returns pictures as lens and sensor make them, of what the scene sends there.
 
   Args:
-    pixels: (height, width, 3) uint8
+    pictures: some of those of a `lens.Lens`, of one camera
     drawn: what `apply` returned
-    time: of the picture [s], which decides the noise
+    fovy: field of view [rad]
+    far: depth where nothing is [m]
+    seed: of the noise
   """
-  veil, exposure, noise = film(drawn)
-  if (veil, exposure, noise) == (0.0, 1.0, 0.0):
-    return pixels
-  out = exposure * ((1 - veil) * (pixels / 255) + veil * SMOKE)
-  if noise:
-    random = np.random.default_rng([int(noise * 2**40), round(1e4 * time)])
-    out += noise * random.standard_normal(out.shape)
-  return (255 * out.clip(0, 1) + 0.5).astype(np.uint8)
+  height, width = next(iter(pictures.values())).shape[:2]
+  values: dict[str, Any] = {name: value[None] for name, value in lens.lens(drawn).items()}
+  values |= {"chosen": np.ones(1, bool), "fovy": np.array([fovy]), "seed": np.array([seed])}
+  values["far"] = far
+  for name in lens.PICTURES:
+    kind: Any = lens.Lens.vars[name].type
+    empty = wp.zeros((0,) * kind.ndim, dtype=kind.dtype, device="cpu")
+    values[f"sent_{name}"] = values[name] = pictures[name][None] if name in pictures else empty
+  view: Any = fill(lens.Lens, "cpu", values)
+  wp.launch(lens.see, dim=(1, height, width), inputs=[view, height, width], device="cpu")
+  return {name: getattr(view, name).numpy()[0] for name in pictures}
 
 
 def table() -> str:

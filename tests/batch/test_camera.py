@@ -6,6 +6,7 @@ import palpate
 import palpate.batch
 import pytest
 from devices import needs_cuda
+from palpate.batch.camera import Camera
 from palpate.tasks import suite
 from scenes.resting import block
 
@@ -147,6 +148,21 @@ def test_some_worlds_can_be_drawn():
   np.testing.assert_array_equal(every.draw()["pixels"].numpy()[2], one.draw()["pixels"].numpy()[0])
   every.choose(None)
   assert one.pictures["pixels"].shape == (1, 16, 20, 3)
+
+
+def test_two_lenses_see_a_distance():
+  batch = palpate.batch.make(shapes(), 1, "warp-cpu")
+  base, size = 0.04, 200
+  camera = Camera(
+    batch, "eye", size, size, ("depth", "segmentation"), [0, 0], shift=[-base / 2, base / 2]
+  )
+  seen = {name: array.numpy() for name, array in camera.draw().items()}
+  ball = (seen["segmentation"] == [0, int(mj.mjtObj.mjOBJ_SITE)]).all(axis=-1)
+  assert ball.sum(axis=(1, 2)).min() > 300
+  column = [np.nonzero(each)[1].mean() for each in ball]
+  middle = np.linalg.norm([0.3 - 0.05, -0.9 + 0.2, 0.5 - 0.1])  # of the ball, near the axis
+  focal = 0.5 * size / np.tan(np.radians(55) / 2)
+  assert column[0] - column[1] == pytest.approx(focal * base / middle, rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -378,9 +378,11 @@ def test_what_pictures_show_is_drawn_for_every_world_as_in_the_single_environmen
   ranges = {
     "camera_pos": (-0.02, 0.02), "camera_turn": (-5, 5), "camera_fovy": (-5, 5),
     "light": (0.5, 1.5), "light_pos": (-0.02, 0.02), "colour": (-0.3, 0.3),
-    "veil": (0.0, 0.4), "exposure": (0.7, 1.3),
+    "veil": (0.0, 0.4), "exposure": (0.7, 1.3), "texture": (1, 16), "lens_k1": (-0.2, -0.1),
+    "lens_k2": (0.0, 0.1), "blur": (-0.03, 0.03), "blood": (3, 8),
   }  # fmt: skip
-  seen = dict(observations=["pixels", "segmentation"], pixels=(48, 64), randomise=ranges)
+  names = ["pixels", "pixels_left", "pixels_right", "segmentation", "soiling"]
+  seen = dict(observations=names, pixels=(48, 64), randomise=ranges)
   envs = make("touch/easy", 2, **seen)
   pictures, infos = envs.reset(seed=5)
   for world in range(2):
@@ -389,5 +391,11 @@ def test_what_pictures_show_is_drawn_for_every_world_as_in_the_single_environmen
     for name, value in info["randomised"].items():
       np.testing.assert_array_equal(infos["randomised"][name][world], value)
     assert (pictures["segmentation"][world] == expected["segmentation"]).mean() > 0.98
-    assert np.abs(pictures["pixels"][world].astype(float) - expected["pixels"]).mean() < 8
+    for name in names[:3]:
+      assert np.abs(pictures[name][world].astype(float) - expected[name]).mean() < 8
+    np.testing.assert_allclose(pictures["soiling"][world], expected["soiling"], atol=1)
+    assert np.ptp(expected["soiling"][..., 1]) > 200
+    right = expected["pixels_right"].astype(float)
+    same, other = (np.abs(right - pictures[name][world]).mean() for name in names[2:0:-1])
+    assert same < 0.7 * other
   assert np.abs(pictures["pixels"][0].astype(float) - pictures["pixels"][1]).mean() > 8

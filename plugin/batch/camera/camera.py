@@ -11,11 +11,12 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.engine.model import flexes
+from palpate.lens import Lens, lens, see
 from palpate.tissue.types import fill
 
 from ..base import refuse_crowd, room_of
 from . import kernels
-from .scene import Scene, colour, labelled
+from .scene import Scene, colour, labelled, texture
 from .soft import Surface
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ OUTPUTS = {  # dtype of Warp, and what follows height and width
   "segmentation": (wp.vec2i, ()),
   "labels": (wp.uint8, ()),
   "points": (wp.vec3, ()),
+  "soiling": (wp.uint8, (2,)),
 }
 _OF_ROWS = ("lamp_pos", "lamp_dir", "ambient", "diffuse", "specular")
 MOST = 1024  # height and width [pixels]
@@ -48,6 +50,7 @@ class Camera:
     pictures: arrays of the last `draw` by name, a row a world; they keep their place
     worlds: numbers of the worlds
     view: what the kernels read, a row a world, see `kernels.View`
+    lens: what pictures are seen through, see `palpate.lens`; None for nothing
   """
 
   def __init__(
@@ -59,7 +62,22 @@ class Camera:
     outputs: Sequence[str] = ("pixels",),
     worlds: Sequence[int] | None = None,
     labels: Mapping[tuple[int, int], int] | None = None,
+    shift: Sequence[float] | None = None,
+    through: bool = False,
   ):
+    """Makes the camera; what is not said here is as in `Batch.camera`.
+
+    Args:
+      batch: the worlds
+      name: of the camera
+      height: of a picture [pixels]
+      width: the same
+      outputs: some of OUTPUTS
+      worlds: of each row, which may have one several times
+      labels: of what has one in `labels`, by its `mjtObj` and number
+      shift: of the lens of each row to the right [m]; None for none
+      through: whether pictures are seen through a `lens`
+    """
     model = batch.model
     self._batch, self.worlds = batch, [*range(batch.nworld)] if worlds is None else [*worlds]
     camera = _camera(model, name)
@@ -84,12 +102,13 @@ class Camera:
     ]
     self._surfaces = [each for each in self._surfaces if each.nvert]
     self._refuse_crowd(size, outputs)
-    self._colours = [each.colour for each in self.scene.things]
     values = self._allocate(size, outputs)
+    values["shift"] = np.zeros(len(self.worlds)) if shift is None else np.array(shift, float)
     values |= self._things(labels) | self._parts() | self._organs(values)
     values |= self._view(model, camera)
     self.view: Any = fill(kernels.View, self._device, values)
     self.pictures = {name: values[name] for name in outputs}
+    self.lens = self._through(outputs, values) if through else None
 
   # Making.
 
@@ -137,32 +156,42 @@ class Camera:
     Returns:
       values of fields of `kernels.View`, without their first axis
     """
-    mat, lamps = np.zeros(9), _lamps(m)
+    mat, lamps, things = np.zeros(9), _lamps(m), self.scene.things
     mujoco.mju_quat2Mat(mat, m.cam_quat[self._number])
     return dict(
       cam_pos=m.cam_pos[self._number], cam_mat=mat.reshape(3, 3),
       fovy=np.radians(m.cam_fovy[self._number]),
-      rgba=np.array([colour(m, *key) for key in self._colours]),
+      rgba=np.array([colour(m, *thing.where) for thing in things]),
+      tex=np.array([texture(m, *t.where) if t.tex >= 0 else -1 for t in things], np.int32),
       **{name: np.array([lamp[name] for lamp in lamps]) for name in _OF_ROWS},
     )  # fmt: skip
 
   def show(self, rows: np.ndarray, values: Mapping[str, np.ndarray]):
-    """Gives rows camera, lamps and colours of their own.
+    """Gives rows camera, lamps, colours or a lens of their own.
 
     Args:
       rows: numbers of rows
-      values: as `look` returns them, a row for each of these
+      values: as `look` returns them, or of a `Lens`, a row for each of these
     """
     for name, value in values.items():
-      array = getattr(self.view, name)
+      array = getattr(self.view if name in kernels.View.vars else self.lens, name)
       whole = array.numpy()
       whole[rows] = value
       array.assign(whole)
 
+  def _through(self, outputs: Sequence[str], sent: Mapping[str, Any]) -> Any:
+    """Returns what pictures are seen through, and shows these in place of those that are sent."""
+    shared = ("chosen", "fovy", "seed", "far")
+    values: dict[str, Any] = {name: getattr(self.view, name) for name in shared}
+    values |= {f"sent_{name}": sent[name] for name in OUTPUTS}
+    values |= {name: wp.zeros_like(sent[name]) for name in OUTPUTS}
+    values |= {name: self._rows(value) for name, value in lens({}).items()}
+    self.pictures = {name: values[name] for name in outputs}
+    return fill(Lens, self._device, values)
+
   def _things(self, labels: Mapping[tuple[int, int], int] | None) -> dict[str, Any]:
     things, scene = self.scene.things, self.scene
     return dict(
-      tex=self._rows([thing.tex for thing in things]).astype(np.int32),
       gloss=np.array([thing.gloss for thing in things]),
       kind=np.array([(thing.id, thing.kind) for thing in things], np.int32),
       label=labelled(things, labels or {}), texel=scene.texels, image=scene.images, sky=scene.sky,
@@ -238,7 +267,7 @@ class Camera:
       near=float(m.vis.map.znear) * extent, far=float(m.vis.map.zfar) * extent, xpos=xpos,
       xmat=xmat, cam_body=int(self._bodies[m.cam_bodyid[camera]]),
       eye=self._rows(np.zeros(3)), look=self._rows(np.eye(3)),
-      film=self._rows([0.0, 1.0, 0.0]), count=np.zeros(1, np.int32),
+      seed=np.arange(len(self.worlds), dtype=np.int32),
       lamp_kind=np.array([lamp["kind"] for lamp in lamps], np.int32),
       lamp_body=np.array(body, np.int32), fade=np.array([lamp["fade"] for lamp in lamps]),
       spot=np.array([lamp["spot"] for lamp in lamps]), lamp_at=self._rows(zero),
@@ -273,11 +302,16 @@ class Camera:
       surface.follow(self.worlds, self.view.lips)
 
   def choose(self, mask: wp.array | None):
-    """Lets the next pictures be of the worlds of a mask on the device alone, None for all."""
+    """Lets the next pictures be of the worlds of a mask on the device alone, None for all.
+
+    Where rows are the worlds several times, the mask is of these.
+    """
+    chosen = self.view.chosen
     if mask is None:
-      self.view.chosen.fill_(True)
+      chosen.fill_(True)
     else:
-      wp.copy(self.view.chosen, mask)
+      for start in range(0, len(chosen), len(mask)):
+        wp.copy(chosen, mask, start, 0, len(mask))
 
   def launch(self):
     """Launches what draws; it can be recorded in a graph."""
@@ -295,6 +329,8 @@ class Camera:
         some = min(c.solid.shape[0], n - start)
         wp.launch(kernels.fill, dim=(some, c.thing.shape[0]), inputs=[c, start])
         wp.launch(kernels.draw, dim=(some, tiles, _TILE), inputs=[c, start], block_dim=_BLOCK)
+      if self.lens is not None:
+        wp.launch(see, dim=(n, c.height, c.width), inputs=[self.lens, c.height, c.width])
 
 
 def _lamps(m: mujoco.MjModel) -> list[dict[str, Any]]:

@@ -23,7 +23,6 @@ NOTHING = 2**64 - 1  # what a pixel has met before a picture
 _NOTHING = wp.constant(wp.uint64(NOTHING))
 LARGEST = 64  # large triangles of a row that are kept
 _LARGEST = wp.constant(LARGEST)
-SMOKE = wp.constant(0.75)  # grey of smoke
 LIP = wp.constant(8e-4)  # width of a cut's lips [m]
 
 
@@ -98,8 +97,8 @@ class View:
   cam_pos: Array(wp.vec3, ("nrow",))  # in the frame of the body [m]
   cam_mat: Array(wp.mat33, ("nrow",))
   fovy: floats("nrow")  # [rad]
-  film: Array(wp.vec3, ("nrow",))  # share of smoke, exposure, noise
-  count: ints(1)  # pictures so far
+  shift: floats("nrow")  # of the lens to the right, for stereo [m]
+  seed: ints("nrow")  # another one in each picture
   eye: Array(wp.vec3, ("nrow",))  # in the world
   look: Array(wp.mat33, ("nrow",))
   # Surfaces: each triangle's thing, texels a metre, and by its corners normals and coordinates.
@@ -178,12 +177,12 @@ class Hit:
 def aim(c: View):
   """Finds where cameras and lamps are."""
   r = wp.tid()
-  if r == 0:
-    c.count[0] = c.count[0] + 1
+  c.seed[r] += 1
   c.nlarge[r] = 0
   w, b = c.world[r], c.cam_body
-  c.eye[r] = c.xpos[w, b] + c.xmat[w, b] * c.cam_pos[r]
-  c.look[r] = c.xmat[w, b] * c.cam_mat[r]
+  look = c.xmat[w, b] * c.cam_mat[r]
+  c.eye[r] = c.xpos[w, b] + c.xmat[w, b] * c.cam_pos[r] + look * wp.vec3(c.shift[r], 0.0, 0.0)
+  c.look[r] = look
   for k in range(c.lamp_kind.shape[0]):
     on = c.lamp_body[k]
     if on < 0:
@@ -568,11 +567,6 @@ def draw(c: View, start: int):
         out = through * through * out + (1.0 - through * through) * shade(c, r, o, d, pixel, hit)
       hit = clear
       left -= 1
-    film = c.film[r]
-    out = film[1] * ((1.0 - film[0]) * out + film[0] * SMOKE * wp.vec3(1.0))
-    if film[2] > 0.0:
-      grain = wp.rand_init(c.count[0], (r * c.height + i) * c.width + j)
-      out += film[2] * wp.vec3(wp.randn(grain), wp.randn(grain), wp.randn(grain))
     for l in range(3):
       c.pixels[r, i, j, l] = wp.uint8(wp.clamp(255.0 * out[l] + 0.5, 0.0, 255.0))
 

@@ -20,6 +20,7 @@ from . import shapes, textures
 from .shapes import Triangles
 
 _OBJ = mujoco.mjtObj
+_RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 SEEN = 3  # groups that are drawn
 _OPAQUE = 0.995  # MuJoCo's
 _PLAIN = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # a colour that leaves a material its own
@@ -33,7 +34,7 @@ class Thing:
     kind: mjtObj
     id: number of that kind
     rgba: its colour as compiled                               (4,)
-    colour: where a model has that, see `colour`
+    where: where a model has its colour and texture: kind, number, its material as compiled or -1
     gloss: emission, specular share, exponent of the specular  (3,)
     tex: its texture, -1 for none
     repeat: of the texture                                     (2,)
@@ -43,7 +44,7 @@ class Thing:
   kind: int
   id: int
   rgba: np.ndarray
-  colour: tuple[int, int, int]
+  where: tuple[int, int, int]
   gloss: np.ndarray
   tex: int
   repeat: np.ndarray
@@ -129,8 +130,7 @@ class Scene:
     if material >= 0:
       gloss = np.array([m.mat_emission[material], m.mat_specular[material],
                         m.mat_shininess[material]])  # fmt: skip
-      role = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
-      tex, uniform = int(m.mat_texid[material, role]), bool(m.mat_texuniform[material])
+      tex, uniform = texture(m, *where), bool(m.mat_texuniform[material])
       repeat = m.mat_texrepeat[material].astype(float)
     gloss[2] *= 128.0  # OpenGL's
     rgba = colour(m, *where)
@@ -258,8 +258,24 @@ def skin(m: mujoco.MjModel, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray 
   return vert.astype(float), face, texcoord
 
 
+def _material(m: mujoco.MjModel, kind: int, number: int, material: int) -> int:
+  """Returns the material that a thing has in a model, -1 for none."""
+  now = {
+    int(_OBJ.mjOBJ_GEOM): m.geom_matid, int(_OBJ.mjOBJ_SITE): m.site_matid,
+    int(_OBJ.mjOBJ_SKIN): m.skin_matid, int(_OBJ.mjOBJ_FLEX): m.flex_matid,
+  }[kind]  # fmt: skip
+  return int(now[number]) if material >= 0 else -1
+
+
+def texture(m: mujoco.MjModel, kind: int, number: int, material: int) -> int:
+  """Returns the texture that a thing has in a model, -1 for none."""
+  material = _material(m, kind, number, material)
+  return int(m.mat_texid[material, _RGB]) if material >= 0 else -1
+
+
 def colour(m: mujoco.MjModel, kind: int, number: int, material: int) -> np.ndarray:
   """Returns the colour that a thing has in a model: its own, or that of its material  (4,)."""
+  material = _material(m, kind, number, material)
   own = {
     int(_OBJ.mjOBJ_GEOM): m.geom_rgba, int(_OBJ.mjOBJ_SITE): m.site_rgba,
     int(_OBJ.mjOBJ_SKIN): m.skin_rgba, int(_OBJ.mjOBJ_FLEX): m.flex_rgba,

@@ -6,11 +6,12 @@ import pathlib
 
 import numpy as np
 import pytest
-from palpate import tasks
+from palpate import lens, tasks
 from palpate.tasks.core import episode, observation, randomisation
 
 PAGE = pathlib.Path(__file__).parents[3] / "docs" / "environments.md"
 RANGES = {
+  "texture": (0, 16),
   "colour": (-0.2, 0.2),
   "stiffness": [0.5, 2],
   "friction": (0.5, 1.5),
@@ -19,7 +20,11 @@ RANGES = {
   "light": (0.5, 1.5),
   "light_pos": (-0.02, 0.02),
   "camera_fovy": (-5, 5),
+  "lens_k1": (-0.2, 0.0),
+  "lens_k2": (0.0, 0.1),
+  "blur": (-0.02, 0.02),
   "veil": (0.1, 0.3),
+  "blood": (0, 8),
   "exposure": (0.8, 1.2),
   "noise": (0.01, 0.05),
 }
@@ -41,7 +46,8 @@ def test_a_seed_repeats_what_is_drawn_and_every_episode_draws_anew():
     drawn.append(first.task.drawn)
   for name, (low, high) in RANGES.items():
     values = np.array([each[name] for each in drawn])
-    assert values.shape[1:] == ((3,) if randomisation.QUANTITIES[name].count == 3 else ())
+    count = randomisation.QUANTITIES[name].count
+    assert values.shape[1:] == ((count,) if count > 1 else ())
     assert (values >= low).all() and (values <= high).all() and (values[0] != values[1]).all()
 
 
@@ -103,18 +109,68 @@ def test_pictures_change():
   assert (colour(seen({"light": (0.5, 0.5)})) < 0.8 * colour(plain)).all()
   assert (colour(seen({"colour": (0.3, 0.3)})) > colour(plain) + 10).all()
   assert (colour(seen({"exposure": (0.5, 0.5)})) < 0.52 * colour(plain)).all()
-  smoke = (0.5, 0.5), 255 * randomisation.SMOKE
+  smoke = (0.5, 0.5), 255 * lens.SMOKE
   half = 0.5 * (colour(plain) + smoke[1])
   np.testing.assert_allclose(colour(seen({"veil": smoke[0]})), half, atol=1)
   noise = seen({"noise": (0.1, 0.1)})["pixels"].astype(float) - plain["pixels"]
   assert 0.07 < noise[organ].std() / 255 < 0.11
   wide = seen({"camera_fovy": (20, 20)})["segmentation"] == observation.LABELS["organ"]
   assert wide.mean() < 0.8 * organ.mean()
+  others = [seen({"texture": (k, k)})["pixels"][organ].astype(float) for k in (0, 15)]
+  assert np.abs(others[0] - plain["pixels"][organ]).mean() < 1  # the target is elsewhere
+  assert 2 < np.abs(others[1] - others[0]).mean() < 30
   turned = seen({"camera_turn": (5, 5)})["segmentation"] == observation.LABELS["organ"]
   moved = seen({"camera_pos": (0.02, 0.02)})["segmentation"] == observation.LABELS["organ"]
   assert turned.shape == (height, width)
   for found in (turned, moved):
     assert (found != organ).mean() > 0.05 and found.mean() > 0.05
+
+
+def looked_at(sent, **drawn):
+  return randomisation.see(sent, drawn, fovy=1.0, far=9.0, seed=3)
+
+
+def test_a_lens_distorts_as_brown_and_conrady_have_it():
+  height, width, k1, k2 = 240, 320, -0.3, 0.08
+  pixel = 2 * np.tan(0.5) / height
+  x, y = np.meshgrid(
+    pixel * (np.arange(width) + 0.5 - width / 2), pixel * (np.arange(height) + 0.5 - height / 2)
+  )
+  sent = np.stack([x, y, np.ones_like(x)], axis=2).astype(np.float32)
+  ramp = (128 + 150 * np.stack([x, y, 0 * x], axis=2)).astype(np.uint8)
+  seen = looked_at({"points": sent, "pixels": ramp}, lens_k1=k1, lens_k2=k2)
+  shown = seen["points"][..., 2] > 0
+  assert 0.7 < shown.mean() < 0.95 and not shown[0, 0] and not seen["pixels"][~shown].any()
+  at = seen["points"][shown][:, :2]
+  r2 = (at**2).sum(axis=1, keepdims=True)
+  expected = at * (1 + k1 * r2 + k2 * r2**2)
+  where = np.stack([x[shown], y[shown]], axis=1)
+  assert np.abs(expected - where).max() < 0.75 * pixel  # the nearest pixel's
+  np.testing.assert_allclose(seen["pixels"][shown][:, 0], 128 + 150 * at[:, 0], atol=2)
+
+
+def test_blur_smears_and_blood_covers():
+  sent = np.zeros((40, 60, 3), np.uint8)
+  sent[20, 30] = 250
+  smeared = looked_at({"pixels": sent}, blur=(0.2, 0.0))["pixels"][..., 0].astype(float)
+  assert smeared.sum() == pytest.approx(250, rel=0.05)
+  assert np.flatnonzero(smeared.sum(axis=0)).tolist() == [*range(26, 35)]  # 8 pixels
+  assert np.flatnonzero(smeared.sum(axis=1)).tolist() == [20]
+  grey = np.full((40, 60, 3), 100, np.uint8)
+  empty = np.zeros((40, 60, 2), np.uint8)
+  seen = looked_at(
+    {"pixels": grey, "soiling": empty}, veil=0.4, blood=4.5, exposure=1.2
+  )
+  smoke, blood = np.moveaxis(seen["soiling"] / 255, 2, 0)
+  np.testing.assert_allclose(smoke, 0.4, atol=1 / 255)
+  assert 0.02 < (blood > 0.5).mean() < 0.4 and (blood == 0).mean() > 0.3
+  without = 1.2 * (0.6 * 100 + 0.4 * 255 * lens.SMOKE)
+  np.testing.assert_allclose(seen["pixels"][blood == 0], without, atol=1)
+  assert (seen["pixels"][blood > 0.9][:, 1] < 0.15 * without).all()
+  more = looked_at({"soiling": empty}, blood=8.5)["soiling"]
+  assert (more[..., 1] > 128).sum() != (seen["soiling"][..., 1] > 128).sum()
+  same = looked_at({"pixels": sent}, noise=0.0)
+  np.testing.assert_array_equal(same["pixels"], sent)
 
 
 def test_copies_and_recordings_have_what_was_drawn(tmp_path):
