@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,7 +18,7 @@ from palpate.tissue.geometry.mesh import Mesh
 from .cutting.fracture import Parting
 
 if TYPE_CHECKING:
-  from .camera import Camera
+  from palpate.camera import Camera
 
 _MOVING = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "plugin_state")
 
@@ -519,25 +518,3 @@ def _named(find: Any, kind: str, name: str) -> Any:
   except KeyError as error:
     have = error.args[0].partition(". ")[2]
     raise ValueError(f"no {kind} {name!r} in the model. {have}") from None
-
-
-def free_memory() -> float:
-  """Returns how many bytes this machine has free, infinity where it does not say."""
-  try:
-    return os.sysconf("SC_AVPHYS_PAGES") * float(os.sysconf("SC_PAGE_SIZE"))
-  except (AttributeError, ValueError, OSError):  # not on every system
-    return float("inf")
-
-
-def room_of(device) -> float:
-  """Returns how many bytes of a device a batch may take."""
-  return 0.95 * (device.free_memory if device.is_cuda else free_memory())
-
-
-def refuse_crowd(nworld: int, each: float, room: float, where: str, what: str = "nworld is"):
-  """Raises ValueError where worlds of so many bytes do not fit; says how many do."""
-  if nworld * each > room:
-    raise ValueError(
-      f"{what} {nworld}, which takes about {nworld * each / 1e9:.1f} GB, but {where} has "
-      f"{room / 1e9:.1f} GB free; expected at most {int(room / each)}"
-    )

@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.camera import Camera
 from palpate.engine import coupling
 from palpate.engine import plugin as engine
 from palpate.engine.cutting import cuts as cutting
@@ -19,12 +20,12 @@ from palpate.engine.model.declare import Declaration
 from palpate.organ import Organ, instances
 from palpate.tissue import body as bodies
 from palpate.tissue.cutting.topology import Report
+from palpate.tissue.device import free_memory, refuse_crowd
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
 
-from .base import Batch, Tissue, free_memory, refuse_crowd, spread
+from .base import Batch, Tissue, spread
 from .bonds import OfThreads
-from .camera import Camera
 from .cutting.fracture import Cutters
 
 _OF_VERTICES = ("xpos", "xvel", "contact_force")

@@ -16,14 +16,14 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
+from palpate.camera import Camera
 from palpate.engine import plugin as engine
 from palpate.forces.cohesive_bonds import Bonds
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
 from . import host, kernels, states, strip_organs
-from .base import Batch, refuse_crowd, room_of
-from .camera import Camera
+from .base import Batch
 from .contact import contacts, convex
 from .contact.fixed_order import FixedOrder, is_enough
 from .organs import Organ
@@ -125,7 +125,7 @@ class Worlds(Batch):
       Organ.bytes_of(w, self.device) for w in spaces.values()
     )
     size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
-    refuse_crowd(nworld, size, room_of(self.device), str(self.device))
+    devices.refuse_crowd(nworld, size, devices.room_of(self.device), str(self.device))
     if deterministic:  # which is what `fixed_order` knows
       bare.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     try:

@@ -202,3 +202,25 @@ def reserve(kernel: wp.Kernel, device, plan: Plan):
 def threads(device, nslice: int) -> int:
   """Returns the launch dimension for `nslice` slices: one thread on the CPU, one a lane on CUDA."""
   return nslice * LANES if device.is_cuda else 1
+
+
+def free_memory() -> float:
+  """Returns how many bytes this machine has free, infinity where it does not say."""
+  try:
+    return os.sysconf("SC_AVPHYS_PAGES") * float(os.sysconf("SC_PAGE_SIZE"))
+  except (AttributeError, ValueError, OSError):  # not on every system
+    return float("inf")
+
+
+def room_of(device) -> float:
+  """Returns how many bytes of a device worlds may take."""
+  return 0.95 * (device.free_memory if device.is_cuda else free_memory())
+
+
+def refuse_crowd(nworld: int, each: float, room: float, where: str, what: str = "nworld is"):
+  """Raises ValueError where worlds of so many bytes do not fit; says how many do."""
+  if nworld * each > room:
+    raise ValueError(
+      f"{what} {nworld}, which takes about {nworld * each / 1e9:.1f} GB, but {where} has "
+      f"{room / 1e9:.1f} GB free; expected at most {int(room / each)}"
+    )

@@ -348,6 +348,12 @@ class Views:
     return found
 
 
+def blank(kind: Any, name: str, device) -> wp.array:
+  """Returns an array without elements for a field of a struct."""
+  own = kind.vars[name].type
+  return wp.zeros((0,) * own.ndim, dtype=own.dtype, device=device)
+
+
 def fill(
   kind: Any, device, values: dict[str, Any], sizes: dict[str, int] | None = None, into: Any = None
 ):

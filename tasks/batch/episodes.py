@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import mujoco as mj
 import numpy as np
-from palpate import lens
+from palpate.camera import lens
 from palpate.models import laparoscope, trocar
 from palpate.tasks.core import randomisation
 from palpate.tasks.core.base import Task

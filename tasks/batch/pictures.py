@@ -10,7 +10,7 @@ from typing import Any
 import mujoco as mj
 import numpy as np
 import warp as wp
-from palpate.batch.camera import Camera
+from palpate.camera import Camera
 from palpate.tasks.core import observation, randomisation, scenes
 from palpate.tissue.types import fill
 
@@ -80,8 +80,11 @@ class Pictures:
     self._camera.show((first + worlds).ravel(), own)
 
   def draw(self, mask: wp.array | None = None):
-    """Draws all worlds, or those of a mask on the device."""
+    """Draws all worlds, or those of a mask on the device, where episodes begin."""
     self._camera.follow()
+    if mask is not None and "flow" in self.arrays:  # nothing has moved yet
+      self._put_marks()
+      self._camera.place()
     self._camera.choose(mask)
     if self._all:
       self._worlds.run(self.launch)
@@ -90,9 +93,13 @@ class Pictures:
 
   def launch(self):
     """Launches what draws."""
+    self._put_marks()
+    self._camera.launch()
+
+  def _put_marks(self):
+    """Launches what moves and colours the marks of the exercise."""
     w, n = self._worlds, len(self._camera.worlds)
     if self._mark and len(self._marks.part):
       w.launch(self._mark, (n, len(self._marks.part)), [w.fields, w.states.records, self._marks])
     if len(self._films.bond):
       w.launch(film, (n, len(self._films.bond)), [w.fields, self._films])
-    self._camera.launch()

@@ -96,7 +96,7 @@ class Exercises(VectorEnv):
     _refuse(task, kwargs)
     chosen = observation.choose(kwargs.get("observations"), kwargs.get("pixels"))
     seen = render_mode or chosen.pictures
-    kwargs = {"surroundings": "abdomen" if seen else "unseen", **kwargs}
+    kwargs = {"surroundings": "abdomen" if seen else "unseen", **kwargs, "renderer": "cpu"}
     single = Exercise(task, **kwargs)
     self.render_mode, self._size = render_mode, (height, width)
     environment = single.environment
@@ -296,6 +296,10 @@ def _refuse(task: str, kwargs: Mapping[str, Any]) -> None:
     if not randomisation.QUANTITIES[name].seen:
       what = f"randomise has {name!r}, which a vectorised exercise cannot do"
       raise NotVectorisedError(f"{task}: {what}; {_ELSE}")
+  truth = {name for name, row in observation.ROWS.items() if row.group == observation.TRUTH}
+  for name in {observation.TRUTH, *truth} & {*(kwargs.get("observations") or ())}:
+    what = f"observations has {name!r}, which a vectorised exercise cannot do"
+    raise NotVectorisedError(f"{task}: {what}; {_ELSE}")
   for name in ("record", "model"):
     if kwargs.get(name):
       what = f"{name} is given, which a vectorised exercise cannot do"

@@ -51,8 +51,9 @@ from palpate.models import situs, trocar
 
 from ..recorder import together
 from ..recording import Event, Settings
-from . import engine, observation, randomisation, safety, scenes, stage
+from . import engine, eyes, observation, randomisation, safety, scenes, stage
 from .environment import CONTROL_TIMESTEP
+from .eyes import OPENGL
 from .handle import ROW
 from .instrument import AXES, JAWS, SCOPE
 from .physics import Physics, check_scene
@@ -118,6 +119,7 @@ class Task(engine.Task):
     input: str = "drives",
     nodes: int | None = None,
     surroundings: str | None = None,
+    renderer: str = OPENGL,
     name: str = "task",
   ):
     """Makes the exercise.
@@ -132,7 +134,7 @@ class Task(engine.Task):
       variants: shapes that episodes are drawn from, None is the mean; the scene's alone by default
       reward: `dense` or `sparse`
       observations: groups (`sensors`, `state`), pictures (`pixels`, `depth`, `segmentation`,
-        `points`) and names of single observations; the two groups by default
+        `points`, ...) and names of single observations; the two groups by default
       pixels: height and width of pictures; given without a picture's name, `pixels` is observed
       randomise: ranges of what is drawn anew for each episode, see `randomisation`
       model: a scene of your own, a file or an MjSpec, in place of `scene`: it has the instrument,
@@ -141,9 +143,11 @@ class Task(engine.Task):
       input: what an action moves: the instrument's position `drives`, or its `handle`
       nodes: of the organ, in place of the scene's
       surroundings: `abdomen`, `unseen` or `none`, in place of the scene's, see `Scene`
+      renderer: what draws pictures: `opengl`, MuJoCo's, or a device, `cpu` or `cuda:0`, as it draws
+        those of batches
       name: domain and task, for instance "touch/easy"
     """
-    self.name = name
+    self.name, self.renderer = name, eyes.check(renderer)
     for limit, value in (("force_limit", force_limit), ("damage", damage)):
       if not 0 < value < math.inf:
         raise ValueError(f"{name}: {limit} is {value}, expected a number > 0 [N]")

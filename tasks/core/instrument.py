@@ -98,6 +98,16 @@ class Instrument:
     """Returns the tip's position [m]  (3,)."""
     return self.sensor("tip_pos")
 
+  def landmarks(self) -> np.ndarray:
+    """Returns the tip, the tips of the left and right jaw, and the shaft in the trocar [m]  (4, 3).
+
+    Without jaws their tips are the tip.
+    """
+    tip, data = self.tip_pos(), self.data.ptr
+    bodies = [self.model.ptr.body(name).id for name in self._jaws.names] if self._jaws else []
+    ends = [data.xpos[b] - data.xmat[b].reshape(3, 3) @ self.model.ptr.body_pos[b] for b in bodies]
+    return np.stack([tip, *(ends or [tip, tip]), self._trocar.pos])
+
   def tip_vel(self) -> np.ndarray:
     """Returns the tip's velocity [m/s]  (3,)."""
     return self.sensor("tip_vel")

@@ -17,14 +17,17 @@ from typing import Any
 import mujoco as mj
 import numpy as np
 from dm_env import specs
+from palpate.camera import lens
 
 from . import randomisation
 from .engine import Camera
+from .eyes import OPENGL, see
 from .instrument import JAWS, SCOPE
 from .physics import COARSE, NEAR, Physics
 from .scenes import CAMERA
 
 GROUPS = ("sensors", "state")
+TRUTH = "truth"  # group of what pictures are labelled with, which only who asks for it has
 SIZE = (84, 84)  # of pictures, height and width [pixels]
 BASE = 0.005  # between the lenses of a stereo laparoscope [m]
 LABELS = {"organ": 1, "instrument": 2, "target": 3}  # of `segmentation`, 0 is anything else
@@ -113,7 +116,62 @@ ROWS = {
     lambda t, p: p.surface(),
   ),
   "progress": Row("state", (1,), "-", "of the task", lambda t, p: np.array([t.progress])),
+  "camera_matrix": Row(
+    TRUTH,
+    (3, 3),
+    "pixels",
+    "of the pictures' pinhole, as OpenCV has it; 0 is the middle of the first pixel",
+    lambda t, p: camera_matrix(t, p),
+  ),
+  "camera_distortion": Row(
+    TRUTH, (2,), "-", "k1, k2 of the lens", lambda t, p: lens.lens(t.drawn)["bend"]
+  ),
+  "camera_pose": Row(
+    TRUTH,
+    (4, 4),
+    "-, m",
+    "from the world to the camera's frame, x right, y down, z forward",
+    lambda t, p: camera_pose(p),
+  ),
+  "keypoints": Row(
+    TRUTH,
+    (4, 3),
+    "pixels, -",
+    "right, down, and 1 where the picture has it and the organ does not hide it: the tip, the tips "
+    "of the left and right jaw, the shaft in the trocar; then the same of the other hand's",
+    lambda t, p: keypoints(t, p),
+  ),
 }
+
+
+def camera_matrix(task: Any, physics: Physics) -> np.ndarray:
+  """Returns the matrix of a picture's pinhole [pixels]  (3, 3)."""
+  height, width = task.observed.size
+  focal = 0.5 * height / math.tan(0.5 * math.radians(physics.camera()[2]))
+  return np.array([[focal, 0, 0.5 * (width - 1)], [0, focal, 0.5 * (height - 1)], [0, 0, 1.0]])
+
+
+def camera_pose(physics: Physics) -> np.ndarray:
+  """Returns what takes points of the world to the camera's frame  (4, 4)."""
+  pos, mat, _ = physics.camera()
+  out = np.eye(4)
+  out[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ mat.T
+  out[:3, 3] = -out[:3, :3] @ pos
+  return out
+
+
+def keypoints(task: Any, physics: Physics) -> np.ndarray:
+  """Returns where pictures have the instruments' points, and whether these are seen  (n, 3)."""
+  points, pose = np.concatenate([hand.landmarks() for hand in physics.hands]), camera_pose(physics)
+  x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
+  k1, k2 = lens.lens(task.drawn)["bend"]
+  r2 = (x / z) ** 2 + (y / z) ** 2
+  bent = (1 + r2 * (k1 + r2 * k2)) / z
+  size, at = task.observed.size, np.stack([x * bent, y * bent, np.ones_like(z)])
+  right, down, _ = camera_matrix(task, physics) @ at
+  inside = (z > 0) & (np.abs(right - (size[1] - 1) / 2) <= size[1] / 2)
+  inside &= np.abs(down - (size[0] - 1) / 2) <= size[0] / 2
+  return np.stack([right, down, inside & ~physics.hidden(points)], axis=1)
 
 
 def _pixels(camera: Camera, physics: Physics) -> np.ndarray:
@@ -168,6 +226,10 @@ def _segmentation(camera: Camera, physics: Physics) -> np.ndarray:
   return out
 
 
+def _flow(camera: Camera, physics: Physics) -> np.ndarray:
+  raise NotImplementedError("MuJoCo's renderer has no flow")
+
+
 def _soiling(camera: Camera, physics: Physics) -> np.ndarray:
   return np.zeros((*camera.render().shape[:2], 2), np.uint8)  # what a lens adds comes later
 
@@ -184,7 +246,7 @@ class Picture:
     low: least value
     high: greatest value
     draw: takes camera and physics, returns it
-    of: what a camera of a batch calls it, see `palpate.lens`
+    of: what a camera of a batch calls it, see `palpate.camera`
     eye: how far the lens is to the right of the laparoscope's [m]
   """
 
@@ -237,6 +299,16 @@ PICTURES = {
     np.inf,
     _points,
     "points",
+  ),
+  "flow": Picture(
+    "pixels",
+    "way of what a pixel shows since the last observation, right and down; not with `opengl`",
+    np.float32,
+    (2,),
+    -np.inf,
+    np.inf,
+    _flow,
+    "flow",
   ),
   "soiling": Picture(
     "-",
@@ -297,19 +369,23 @@ def choose(names: Sequence[str] | None, size: Any) -> Choice:
 
 
 def _known() -> str:
-  return ", ".join((*GROUPS, *PICTURES)) + " or single observations"
+  return ", ".join((*GROUPS, TRUTH, *PICTURES)) + " or single observations"
 
 
 def check(task: Any, physics: Physics) -> None:
   """Raises ValueError for a name that is no group, picture or observation of a task."""
   single = [*(name for name, *_ in _rows(task.prefix, task.second)), *task.observe(physics)]
   for name in task.observed.names:
-    if name not in (*GROUPS, *PICTURES, *single):
+    if name not in (*GROUPS, TRUTH, *PICTURES, *single):
       raise ValueError(
         f"{task.name}: observations has {name!r}, expected some of {_known()}: {', '.join(single)}"
       )
   model, (height, width) = physics.model.ptr, task.observed.size
   most = model.vis.global_.offheight, model.vis.global_.offwidth
+  if task.renderer != OPENGL:
+    return
+  if "flow" in task.observed.names:
+    raise ValueError(f"{task.name}: observations has 'flow', which renderer opengl cannot draw")
   if task.observed.pictures and (height > most[0] or width > most[1]):
     raise ValueError(
       f"pixels is {height}, {width}, expected at most {most[0]}, {most[1]}: the model's offscreen "
@@ -320,25 +396,43 @@ def check(task: Any, physics: Physics) -> None:
 def take(task: Any, physics: Physics) -> collections.OrderedDict:
   """Returns what a task observes."""
   out = _numbers(task, physics)
-  numbers, names = [*out], task.observed.pictures
-  if names:
-    height, width = task.observed.size
-    model, place = physics.model.ptr, physics.data.ptr.cam_xpos
-    number = model.camera(CAMERA).id
-    camera, middle = Camera(physics, height, width, number), place[number].copy()
-    fovy, right = math.radians(model.cam_fovy[number]), physics.camera()[1][:, 0]
-    for eye in sorted({PICTURES[name].eye for name in names}):
-      own = [name for name in names if PICTURES[name].eye == eye]
-      place[number] = middle + eye * right
-      seen = {PICTURES[name].of: PICTURES[name].draw(camera, physics) for name in own}
-      if randomisation.through(task.ranges):
-        seed = round(1e4 * physics.time()) + round(1e6 * eye)
-        seen = randomisation.see(seen, task.drawn, fovy, far(physics), seed)
-      out |= {name: seen[PICTURES[name].of] for name in own}
-    place[number] = middle
-    camera.scene.free()
-    out = collections.OrderedDict((name, out[name]) for name in [*numbers, *names])
+  pictures = {name: PICTURES[name] for name in task.observed.pictures}
+  if not pictures:
+    return out
+  draw = _render if task.renderer == OPENGL else _draw
+  sent = draw(task, physics, list(pictures.values()))
+  if randomisation.through(task.ranges):
+    fovy, seed = math.radians(physics.camera()[2]), round(1e4 * physics.time())
+    for eye in {picture.eye for picture in pictures.values()}:
+      own = {of: value for (of, of_eye), value in sent.items() if of_eye == eye}
+      own = randomisation.see(own, task.drawn, fovy, far(physics), seed + round(1e6 * eye))
+      sent |= {(of, eye): value for of, value in own.items()}
+  out |= {name: sent[picture.of, picture.eye] for name, picture in pictures.items()}
   return out
+
+
+def _render(task: Any, physics: Physics, pictures: list[Picture]) -> dict[Any, np.ndarray]:
+  """Returns what MuJoCo's renderer draws, by what it is of and the shift of the lens."""
+  model, place = physics.model.ptr, physics.data.ptr.cam_xpos
+  number = model.camera(CAMERA).id
+  height, width = task.observed.size
+  camera = Camera(physics, height, width, number)
+  (middle, mat, _), sent = physics.camera(), {}
+  for picture in pictures:
+    place[number] = middle + picture.eye * mat[:, 0]
+    sent[picture.of, picture.eye] = picture.draw(camera, physics)
+  place[number] = middle
+  camera.scene.free()
+  return sent
+
+
+def _draw(task: Any, physics: Physics, pictures: list[Picture]) -> dict[Any, np.ndarray]:
+  """Returns what a device draws, see `_render`."""
+  shift = sorted({picture.eye for picture in pictures})
+  of = list(dict.fromkeys(picture.of for picture in pictures))
+  begins, size = physics.time() == 0, task.observed.size
+  seen = see(physics, labels(physics), task.renderer, size, of, shift, begins)
+  return {(name, eye): seen[name][k] for name in of for k, eye in enumerate(shift)}
 
 
 def _numbers(task: Any, physics: Physics) -> collections.OrderedDict:
@@ -365,7 +459,7 @@ def _plan(choice: Choice, first: str, second: str) -> tuple[list, Any]:
   """Returns names, measures, hands of the chosen rows, and the domain's own names or "all"."""
   known = _rows(first, second)
   rows = [(name, row.measure, k) for name, row, k in known if choice.has(name, row.group)]
-  own = set(choice.names) - {name for name, *_ in known} - set(PICTURES) - {"sensors"}
+  own = set(choice.names) - {name for name, *_ in known} - set(PICTURES) - {"sensors", TRUTH}
   return rows, "all" if "state" in own else own
 
 

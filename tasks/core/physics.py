@@ -37,6 +37,7 @@ class Physics(Instrument, Portable):
     second: the instrument of the other hand, None where there is none
     guided: an instrument that the exercise itself moves, in nobody's hand; None for none
     looked: where `look_from` has put the laparoscope, and its orientation; None where it stands
+    eyes: what draws pictures without OpenGL, once it did
     meanwhile: called in the middle of every `step`, with what need not be done at its end, where a
       live exercise has least time; None for nothing
   """
@@ -44,6 +45,7 @@ class Physics(Instrument, Portable):
   second: Second | None = None
   guided: Second | None = None
   looked: np.ndarray | None = None
+  eyes: Any = None
   meanwhile: Callable[[], None] | None = None
 
   def use(

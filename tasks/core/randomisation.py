@@ -16,9 +16,9 @@ from typing import Any
 import mujoco as mj
 import numpy as np
 import warp as wp
-from palpate import lens
-from palpate.lens import DROPS
-from palpate.tissue.types import fill
+from palpate.camera import lens
+from palpate.camera.lens import DROPS
+from palpate.tissue.types import blank, fill
 
 from . import stage
 from .physics import Physics
@@ -231,9 +231,8 @@ def see(
   values |= {"chosen": np.ones(1, bool), "fovy": np.array([fovy]), "seed": np.array([seed])}
   values["far"] = far
   for name in lens.PICTURES:
-    kind: Any = lens.Lens.vars[name].type
-    empty = wp.zeros((0,) * kind.ndim, dtype=kind.dtype, device="cpu")
-    values[f"sent_{name}"] = values[name] = pictures[name][None] if name in pictures else empty
+    sent = pictures[name][None] if name in pictures else blank(lens.Lens, name, "cpu")
+    values[f"sent_{name}"] = values[name] = sent
   view: Any = fill(lens.Lens, "cpu", values)
   wp.launch(lens.see, dim=(1, height, width), inputs=[view, height, width], device="cpu")
   return {name: getattr(view, name).numpy()[0] for name in pictures}

@@ -24,8 +24,13 @@ from ..recording import Recording
 
 OPEN = ("time limit", "stopped")  # outcomes of an episode that could have gone on
 # What LeRobot calls the groups, in data sets and in environments, and the pictures.
-VECTORS = {"observation.state": "sensors", "observation.environment_state": "state"}
-PIXELS = "observation.images.laparoscope"
+VECTORS = {
+  "observation.state": "sensors", "observation.environment_state": "state",
+  "observation.truth": "truth",
+}  # fmt: skip
+FILMS = {
+  f"pixels{side}": f"observation.images.laparoscope{side}" for side in ("", "_left", "_right")
+}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -175,7 +180,7 @@ def _made(env: _Watched, recording: Recording) -> Demonstration:
 
 
 def group(name: str) -> str:
-  """Returns the group of an observation: `sensors`, `state` or `pictures`."""
+  """Returns the group of an observation: `sensors`, `state`, `truth` or `pictures`."""
   if name in observation.PICTURES:
     return "pictures"
   return observation.ROWS[name].group if name in observation.ROWS else "state"

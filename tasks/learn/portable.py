@@ -17,7 +17,7 @@ from ..core.scenes import ORGAN
 
 # What belongs to one process or is made anew from the data.
 _OWN = {"_contexts", "_contexts_lock", "_data", "_named", "organ", "handle"}
-_OWN |= {"meanwhile", "_warnings", "_warnings_before", "_new_warnings"}
+_OWN |= {"eyes", "meanwhile", "_warnings", "_warnings_before", "_new_warnings"}
 
 
 class Portable(Physics):

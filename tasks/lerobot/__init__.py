@@ -19,14 +19,14 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
 from .. import gym
-from ..learn.demonstrations import PIXELS, VECTORS, instruction, vector
+from ..learn.demonstrations import FILMS, VECTORS, instruction, vector
 
 # OpenBLAS's threads can wait for ever in processes that are forked, as asynchronous vectors are.
 # They begin later than this and read it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _ID = "palpate/LeRobot-v0"
-_CAMERA = PIXELS.rpartition(".")[2]
+_CAMERAS = {name: film.rpartition(".")[2] for name, film in FILMS.items()}
 # What an environment calls the columns `VECTORS`, and what they are.
 _STATES = {
   "agent_pos": ("observation.state", FeatureType.STATE),
@@ -49,7 +49,8 @@ class Exercise(gymnasium.Wrapper):
       for name, value in known.items() if name != "pixels"
     }  # fmt: skip
     if "pixels" in known:
-      mine["pixels"] = gymnasium.spaces.Dict({_CAMERA: boxes["pixels"]})
+      seen = {camera: boxes[name] for name, camera in _CAMERAS.items() if name in boxes.spaces}
+      mine["pixels"] = gymnasium.spaces.Dict(seen)
     self.observation_space = gymnasium.spaces.Dict(mine)
 
   def reset(self, **kwargs: Any):
@@ -65,9 +66,8 @@ class Exercise(gymnasium.Wrapper):
   def _named(self, observation: dict[str, np.ndarray]) -> dict[str, Any]:
     found = {name: vector(observation, VECTORS[key]) for name, (key, _) in _STATES.items()}
     named: dict[str, Any] = {name: value for name, value in found.items() if value.size}
-    if "pixels" in observation:
-      named["pixels"] = {_CAMERA: observation["pixels"]}
-    return named
+    seen = {camera: observation[name] for name, camera in _CAMERAS.items() if name in observation}
+    return named | ({"pixels": seen} if seen else {})
 
 
 gymnasium.register(_ID, entry_point=Exercise)
@@ -97,14 +97,16 @@ class Palpate(EnvConfig):
     spaces: Any = env.observation_space
     self.fps, self._steps = env.metadata["render_fps"], env.unwrapped.environment.step_limit
     self.features = {"action": PolicyFeature(FeatureType.ACTION, env.action_space.shape)}
-    self.features_map = {"action": "action", PIXELS: PIXELS}
+    self.features_map = {"action": "action"}
     for name, (key, kind) in _STATES.items():
       self.features_map[name] = key
       if name in spaces.spaces:
         self.features[name] = PolicyFeature(kind, spaces[name].shape)
-    if "pixels" in spaces.spaces:
-      shape = spaces["pixels"][_CAMERA].shape
-      self.features[PIXELS] = PolicyFeature(FeatureType.VISUAL, shape)
+    for name, camera in _CAMERAS.items():
+      self.features_map[FILMS[name]] = FILMS[name]
+      if "pixels" in spaces.spaces and camera in spaces["pixels"].spaces:
+        shape = spaces["pixels"][camera].shape
+        self.features[FILMS[name]] = PolicyFeature(FeatureType.VISUAL, shape)
     env.close()
 
   @property

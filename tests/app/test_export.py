@@ -125,6 +125,22 @@ def test_robomimic_itself_reads_it(data, episodes):
   assert len(read) == sum(map(len, episodes)) and read[0]["obs"]["pixels"].shape[1:] == (32, 48, 3)
 
 
+def test_truth_and_pictures_without_opengl():
+  seen = ["sensors", "truth", "pixels", "pixels_left", "depth", "flow"]
+  words = ["--episodes", 1, "--processes", 1, "--renderer", "cpu", "--size", "24x32"]
+  assert export("touch/easy", "-o", "out", *words, "--observations", *seen) == 0
+  with h5py.File("out/demos.hdf5") as file:
+    demo = file["data/demo_0"]
+    steps = demo.attrs["num_samples"]
+    assert json.loads(demo.attrs["task_kwargs"])["renderer"] == "cpu"
+    assert demo["obs/flow"].shape == (steps, 24, 32, 2) and not demo["obs/flow"][0].round(2).any()
+    assert np.abs(demo["obs/flow"][:]).max() > 0.2
+    assert demo["obs/keypoints"].shape == (steps, 4, 3)
+    assert demo["obs/camera_pose"].shape == (steps, 4, 4)
+    assert (demo["obs/pixels"][5] != demo["obs/pixels_left"][5]).any()
+  assert "--renderer cpu" in pathlib.Path("out/README.md").read_text()
+
+
 # Minari.
 
 
@@ -287,7 +303,7 @@ def test_a_full_disk_is_named_and_nothing_is_lost(tmp_path, monkeypatch, capsys)
     (["touch/easy", "--noise", "2"], "noise is 2.0, expected a number in [0, 1]"),
     (["touch/easy", "--size", "84"], "size is '84', expected height and width such as 96x128"),
     ([*ROBOT, "--observations", "pixels", "--size", "33x48"], "expected even numbers"),
-    ([*ROBOT, "--observations", "sensors", "depth"], "of pictures lerobot has pixels alone"),
+    ([*ROBOT, "--observations", "sensors", "depth"], "of pictures lerobot has pixels, pixels_left"),
     (["touch/easy", "--observations", "sensor"], "observations has 'sensor', expected some of"),
     (["--recordings", "nowhere"], "nowhere"),
   ],

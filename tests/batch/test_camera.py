@@ -6,7 +6,8 @@ import palpate
 import palpate.batch
 import pytest
 from devices import needs_cuda
-from palpate.batch.camera import Camera
+from palpate.camera import Camera
+from palpate.camera.host import Single
 from palpate.tasks import suite
 from scenes.resting import block
 
@@ -181,6 +182,60 @@ def test_two_lenses_see_a_distance():
   assert column[0] - column[1] == pytest.approx(focal * base / middle, rel=0.05)
 
 
+def pixels_of(place):
+  """Returns where places in the camera's frame, z forward, are on a picture of `SHAPES`."""
+  focal = 0.5 * SIZE / np.tan(np.radians(55) / 2)
+  return focal * place[..., :2] / place[..., 2:] + (SIZE - 1) / 2
+
+
+def test_flow_of_a_body_is_that_of_its_turn():
+  batch = palpate.batch.make(shapes(), 2, "warp-cpu")
+  camera = batch.camera("eye", SIZE, SIZE, ("points", "flow", "segmentation"))
+  batch.pose(["swing"], [[0.0], [0.1]])
+  camera.draw()
+  batch.pose(["swing"], [[0.0], [0.2]])
+  seen = {name: array.numpy() for name, array in camera.draw().items()}
+  np.testing.assert_allclose(seen["flow"][0], 0, atol=1e-4)
+  model, data = batch.model, mj.MjData(batch.model)
+  mj.mj_forward(model, data)
+  place, mat = data.cam_xpos[0], data.cam_xmat[0].reshape(3, 3) @ np.diag([1, -1, -1])
+  geoms = np.flatnonzero(model.geom_bodyid == model.body("swing").id)
+  kind = seen["segmentation"][1]
+  moved = np.isin(kind[..., 0], geoms) & (kind[..., 1] == mj.mjtObj.mjOBJ_GEOM)
+  assert moved.sum() > 200
+  np.testing.assert_allclose(seen["flow"][1][~moved], 0, atol=1e-4)
+  points = seen["points"][1][moved].astype(float)
+  hinge, c, s = data.body("swing").xpos, np.cos(-0.1), np.sin(-0.1)
+  back = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+  before = (hinge + (place + points @ mat.T - hinge) @ back.T - place) @ mat
+  expected = pixels_of(points) - pixels_of(before)
+  assert np.abs(expected).max() > 1
+  np.testing.assert_allclose(seen["flow"][1][moved], expected, atol=2e-3)
+
+
+def test_flow_of_tissue_is_that_of_its_stretch():
+  model = shapes().compile()
+  data = mj.MjData(model)
+  mj.mj_forward(model, data)
+  organ = palpate.Organ(model, data, "organ")
+  camera = Camera(Single(model, data, "cpu"), "eye", SIZE, SIZE, ("points", "flow", "segmentation"))
+  camera.draw()
+  stretch, shift = np.diag([1.2, 0.9, 1.3]), np.array([0.02, 0.0, 0.03])
+  middle = organ.xpos0.mean(axis=0)
+  organ.set_state(xpos=middle + shift + (organ.xpos0 - middle) @ stretch)
+  mj.mj_forward(model, data)
+  seen = {name: array.numpy()[0] for name, array in camera.draw().items()}
+  own = seen["segmentation"][..., 1] == mj.mjtObj.mjOBJ_FLEX
+  assert own.sum() > 40
+  place, mat = data.cam_xpos[0], data.cam_xmat[0].reshape(3, 3) @ np.diag([1, -1, -1])
+  points = seen["points"][own].astype(float)
+  world = place + points @ mat.T
+  before = (middle + (world - shift - middle) / np.diag(stretch) - place) @ mat
+  expected = pixels_of(points) - pixels_of(before)
+  assert np.abs(expected).max() > 2
+  np.testing.assert_allclose(seen["flow"][own], expected, atol=0.1)  # the flex's radius is not cut
+
+
 @pytest.mark.parametrize(
   "args, message",
   [
@@ -200,6 +255,6 @@ def test_what_a_camera_cannot_be_is_named(args, message):
 
 def test_a_crowd_is_told_how_many_pictures_fit(monkeypatch):
   batch = palpate.batch.make(shapes(), 2, "cpu")
-  monkeypatch.setattr("palpate.batch.camera.camera.room_of", lambda device: 4e6)
+  monkeypatch.setattr("palpate.camera.camera.room_of", lambda device: 4e6)
   with pytest.raises(ValueError, match=r"worlds to draw are 2, .* expected at most 1"):
     batch.camera("eye", 1000, 1000)

@@ -333,13 +333,25 @@ def test_arrays_of_warp():
 
 def test_pictures_are_those_of_the_single_environment():
   task, names = "dissect/easy", ("pixels", "depth", "segmentation", "points")  # has marks and films
+  more = ("pixels_left", "flow")
   seen = dict(observations=["tip_pos", *names], pixels=(48, 64))
-  envs = make(task, 2, render_mode="rgb_array", width=32, height=24, **seen)
+  envs = make(
+    task, 2, render_mode="rgb_array", width=32, height=24, pixels=(48, 64),
+    observations=[*names, *more],
+  )  # fmt: skip
   env = single(task, **seen)
-  found, expected = envs.reset(seed=3)[0], env.reset(seed=3)[0]
+  seen["observations"] = [*names, *more]
+  drawn = single(task, renderer="cpu", **seen)
+  found, expected, same = (each.reset(seed=3)[0] for each in (envs, env, drawn))
+  for flow in (found["flow"], same["flow"]):
+    np.testing.assert_allclose(flow, 0, atol=2e-3)
   for _ in range(3):
     action = np.random.RandomState(0).uniform(-1, 1, env.action_space.shape)
     found, expected = envs.step(np.tile(action, (2, 1)))[0], env.step(action)[0]
+    same = drawn.step(action)[0]
+  for name in (*names, *more):
+    assert (np.abs(found[name][0].astype(float) - same[name]) < 1e-3).mean() > 0.999
+  assert np.abs(same["flow"][same["segmentation"] == 2]).max() > 0.1
   for name in names:
     assert found[name].shape[1:] == expected[name].shape
     assert found[name].dtype == expected[name].dtype

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from palpate.tasks.learn.demonstrations import (
-  PIXELS,
+  FILMS,
   VECTORS,
   Demonstration,
   components,
@@ -33,9 +33,11 @@ _KEPT = ("seed", "outcome", "performer", "return")  # of an episode
 def check(env: Any) -> None:
   """Raises ValueError for pictures that are no films, and for a broken rate."""
   observed, (height, width) = env.task.observed, env.task.observed.size
-  others = [name for name in observed.pictures if name != "pixels"]
+  others = [name for name in observed.pictures if name not in FILMS]
   if others:
-    raise ValueError(f"observations has {others[0]!r}, of pictures lerobot has pixels alone")
+    raise ValueError(
+      f"observations has {others[0]!r}, of pictures lerobot has {', '.join(FILMS)} alone"
+    )
   if observed.pictures and (height % 2 or width % 2):
     raise ValueError(f"pixels is {height}, {width}, expected even numbers for a film")
   rate = 1 / env.control_timestep()
@@ -63,7 +65,8 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
     return []
   dataset.finalize()
   (folder / "meta/palpate.json").write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
-  films = ["its pictures are compressed (AV1)"] if PIXELS in dataset.features else []
+  seen = any(film in dataset.features for film in FILMS.values())
+  films = ["its pictures are compressed (AV1)"] if seen else []
   return ["the last observation of an episode, which no action answers",
           "numbers beyond float32", *films]  # fmt: skip
 
@@ -75,8 +78,7 @@ def frames(demo: Demonstration) -> Iterator[dict[str, np.ndarray]]:
     observed = {name: value[k] for name, value in demo.observations.items()}
     found = {key: vector(observed, kind) for key, kind in VECTORS.items()}
     frame = {key: value for key, value in found.items() if value.size}
-    if "pixels" in observed:
-      frame[PIXELS] = observed["pixels"]
+    frame |= {film: observed[name] for name, film in FILMS.items() if name in observed}
     forces = {f"next.{name}": value[k + 1].astype("f4") for name, value in demo.forces.items()}
     yield frame | forces | {
       "action": demo.actions[k].astype("f4"),
@@ -90,10 +92,11 @@ def features(demo: Demonstration) -> dict[str, dict[str, Any]]:
   """Returns type, shape and names of each column, as lerobot asks for them."""
   observed = {name: value[0] for name, value in demo.observations.items()}
   names = {key: components(observed, kind) for key, kind in VECTORS.items()}
-  names |= {"action": list(demo.components), PIXELS: ["height", "width", "channels"]}
+  names |= {"action": list(demo.components)}
+  names |= {film: ["height", "width", "channels"] for film in FILMS.values()}
   return {
     key: {
-      "dtype": "video" if key == PIXELS else value.dtype.name,
+      "dtype": "video" if key in FILMS.values() else value.dtype.name,
       "shape": value.shape,
       "names": names.get(key),
     }

@@ -26,7 +26,7 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
 
   kwargs = {name: value for name, value in about.task_kwargs.items() if name != "random"}
   env = gymnasium.make(registry.gym_id(*about.task.split("/")), **kwargs)
-  jpeg = "segmentation" not in env.observation_space.spaces  # labels are no colours
+  jpeg = not {"segmentation", "soiling"} & {*env.observation_space.spaces}  # labels are no colours
   storage = MinariStorage.new(
     folder / "data",
     env.observation_space,

@@ -96,6 +96,10 @@ def add_arguments(parser: argparse.ArgumentParser):
     help="groups (sensors, state), pictures (pixels, ...) and single ones (sensors state)",
   )  # fmt: skip
   add("--size", metavar="HxW", help="of pictures [pixels] (84x84)")
+  add(
+    "--renderer", metavar="NAME",
+    help="what draws pictures: opengl, or a device, cpu or cuda:0, which needs no OpenGL (opengl)",
+  )  # fmt: skip
   options.add_argument(parser)
   add("--failures", action="store_true", help="include episodes without success, marked as such")
   add("--licence", metavar="NAME", help=f"of the data ({_LICENCE}; unknown for recordings)")
@@ -143,6 +147,7 @@ def _command(args: argparse.Namespace) -> str:
     words += ["--noise", args.noise] if args.noise else []
   words += ["--observations", *args.observations]
   words += ["--size", args.size] if args.size else []
+  words += ["--renderer", args.renderer] if args.renderer else []
   words += [word for text in args.set for word in ("--set", text)]
   return shlex.join(str(word) for word in words if word != "")
 
@@ -154,6 +159,8 @@ def _todo(args: argparse.Namespace) -> tuple[str, dict[str, Any], list[tuple[str
   chosen: dict[str, Any] = {"observations": args.observations}
   if args.size:
     chosen["pixels"] = _size(args.size)
+  if args.renderer:
+    chosen["renderer"] = args.renderer
   kwargs, found = options.read(args.set), []
   try:
     if args.recordings:
@@ -175,7 +182,7 @@ def _todo(args: argparse.Namespace) -> tuple[str, dict[str, Any], list[tuple[str
 
 
 def _check_drawing(env: Any):
-  if not env.task.observed.pictures:
+  if not env.task.observed.pictures or env.task.renderer != "opengl":
     return
   try:
     env.physics.render(16, 16)

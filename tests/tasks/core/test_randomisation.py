@@ -6,7 +6,8 @@ import pathlib
 
 import numpy as np
 import pytest
-from palpate import lens, tasks
+from palpate import tasks
+from palpate.camera import lens
 from palpate.tasks.core import episode, observation, randomisation
 
 PAGE = pathlib.Path(__file__).parents[3] / "docs" / "environments.md"

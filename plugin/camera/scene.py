@@ -212,10 +212,8 @@ class Scene:
     if not 0 <= m.site_group[s] < SEEN:
       return
     k = self.thing(_OBJ.mjOBJ_SITE, s, int(m.site_matid[s]))
-    kind, size = int(m.site_type[s]), m.site_size[s]
-    stretched = kind in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_ELLIPSOID)
-    full = size if stretched else np.full(3, size[0])
-    unit = np.ones(3) if stretched else size / size[0]
+    kind, size, full = int(m.site_type[s]), m.site_size[s], site_size(m, s)
+    unit = size / full
     mat = np.zeros(9)
     mujoco.mju_quat2Mat(mat, m.site_quat[s])
     surface = shapes.primitive(m, kind, unit)
@@ -243,6 +241,12 @@ class Scene:
 _NOTHING = Triangles(
   np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros((1, 3, 3)), np.zeros((1, 3, 3))
 )
+
+
+def site_size(m: mujoco.MjModel, s: int) -> np.ndarray:
+  """Returns the size of a site's part: of each axis, or one where its shape is kept  (3,)."""
+  stretched = m.site_type[s] in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_ELLIPSOID)
+  return np.array(m.site_size[s]) if stretched else np.full(3, m.site_size[s, 0])
 
 
 def skin(m: mujoco.MjModel, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:

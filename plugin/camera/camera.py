@@ -11,18 +11,17 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.engine.model import flexes
-from palpate.lens import Lens, lens, see
-from palpate.tissue.types import fill
+from palpate.tissue.device import refuse_crowd, room_of
+from palpate.tissue.types import blank, fill
 
-from ..base import refuse_crowd, room_of
 from . import kernels
-from .scene import Scene, colour, labelled, texture
+from .host import Host
+from .lens import Lens, lens, see
+from .scene import Scene, colour, labelled, site_size, texture
 from .soft import Surface
 
 if TYPE_CHECKING:
   from palpate.engine.model.declare import Declaration
-
-  from ..base import Batch
 
 _OBJ, _LIGHT = mujoco.mjtObj, mujoco.mjtLightType
 OUTPUTS = {  # dtype of Warp, and what follows height and width
@@ -31,8 +30,10 @@ OUTPUTS = {  # dtype of Warp, and what follows height and width
   "segmentation": (wp.vec2i, ()),
   "labels": (wp.uint8, ()),
   "points": (wp.vec3, ()),
+  "flow": (wp.vec2, ()),
   "soiling": (wp.uint8, (2,)),
 }
+_MOVED = ("eye", "look", "to_eye", "from_eye", "point")  # what a flow is found from
 _OF_ROWS = ("lamp_pos", "lamp_dir", "ambient", "diffuse", "specular")
 MOST = 1024  # height and width [pixels]
 _VERTEX, _TRIANGLE = 36.0, 13.0  # bytes that a row has for those of organs
@@ -50,12 +51,12 @@ class Camera:
     pictures: arrays of the last `draw` by name, a row a world; they keep their place
     worlds: numbers of the worlds
     view: what the kernels read, a row a world, see `kernels.View`
-    lens: what pictures are seen through, see `palpate.lens`; None for nothing
+    lens: what pictures are seen through, see `lens`; None for nothing
   """
 
   def __init__(
     self,
-    batch: Batch,
+    batch: Host,
     name: str,
     height: int,
     width: int,
@@ -106,7 +107,10 @@ class Camera:
     values["shift"] = np.zeros(len(self.worlds)) if shift is None else np.array(shift, float)
     values |= self._things(labels) | self._parts() | self._organs(values)
     values |= self._view(model, camera)
+    values |= {f"{n}_before": blank(kernels.View, f"{n}_before", self._device) for n in _MOVED}
     self.view: Any = fill(kernels.View, self._device, values)
+    for name in _MOVED if "flow" in outputs else ():
+      setattr(self.view, f"{name}_before", wp.zeros_like(getattr(self.view, name)))
     self.pictures = {name: values[name] for name in outputs}
     self.lens = self._through(outputs, values) if through else None
 
@@ -166,6 +170,14 @@ class Camera:
       **{name: np.array([lamp[name] for lamp in lamps]) for name in _OF_ROWS},
     )  # fmt: skip
 
+  def sites(self, m: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Returns where a model has its sites and how large they are, as `look` does."""
+    parts = [each for each in self.scene.parts if len(each.surface.face)]
+    pos, size = np.array([p.pos for p in parts]), np.array([p.size for p in parts])
+    for site, part in self._sites.items():
+      pos[part], size[part] = m.site_pos[site], site_size(m, site)
+    return {"part_pos": pos, "part_size": size}
+
   def show(self, rows: np.ndarray, values: Mapping[str, np.ndarray]):
     """Gives rows camera, lamps, colours or a lens of their own.
 
@@ -175,7 +187,7 @@ class Camera:
     """
     for name, value in values.items():
       array = getattr(self.view if name in kernels.View.vars else self.lens, name)
-      whole = array.numpy()
+      whole = np.array(value, np.float32) if len(rows) == len(self.worlds) else array.numpy()
       whole[rows] = value
       array.assign(whole)
 
@@ -313,17 +325,25 @@ class Camera:
       for start in range(0, len(chosen), len(mask)):
         wp.copy(chosen, mask, start, 0, len(mask))
 
-  def launch(self):
-    """Launches what draws; it can be recorded in a graph."""
-    c, n, device = self.view, len(self.worlds), self._device
+  def place(self):
+    """Launches what finds where everything is now; `flow` is the way since the call before."""
+    c, n = self.view, len(self.worlds)
     self._batch.poses()
-    with wp.ScopedDevice(device):
+    with wp.ScopedDevice(self._device):
+      for name in _MOVED if "flow" in self.pictures else ():
+        wp.copy(getattr(c, f"{name}_before"), getattr(c, name))
       for surface, soft in zip(self._surfaces, self._soft, strict=True):
         soft.x = surface.tissue.xpos
         wp.launch(kernels.follow, dim=(n, surface.nvert), inputs=[soft])
         wp.launch(kernels.lift, dim=(n, surface.nvert), inputs=[soft])
       wp.launch(kernels.aim, dim=n, inputs=[c])
       wp.launch(kernels.put, dim=(n, c.part_body.shape[0]), inputs=[c])
+
+  def launch(self):
+    """Launches what draws; it can be recorded in a graph."""
+    c, n = self.view, len(self.worlds)
+    self.place()
+    with wp.ScopedDevice(self._device):
       tiles = -(-c.width // 8) * -(-c.height // 4)
       for start in range(0, n, c.solid.shape[0]):
         some = min(c.solid.shape[0], n - start)

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-
-from .tissue.types import Array, floats, ints, struct
+from palpate.tissue.types import Array, floats, ints, struct
 
 SMOKE = 0.75  # its grey
 DROPS = 16  # of blood, at most
-PICTURES = ("pixels", "depth", "segmentation", "labels", "points", "soiling")  # of a `Lens`
+PICTURES = ("pixels", "depth", "segmentation", "labels", "points", "flow", "soiling")  # of a `Lens`
 _SMOKE, _DROPS = wp.constant(SMOKE), wp.constant(DROPS)
 _BLOOD = wp.constant(wp.vec3(0.30, 0.02, 0.02))
 _THICK = wp.constant(0.92)  # share of a drop's colour in its middle
@@ -40,12 +39,14 @@ class Lens:
   sent_segmentation: Array(wp.vec2i, ("nrow", "height", "width"))
   sent_labels: Array(wp.uint8, ("nrow", "height", "width"))
   sent_points: Array(wp.vec3, ("nrow", "height", "width"))
+  sent_flow: Array(wp.vec2, ("nrow", "height", "width"))
   sent_soiling: Array(wp.uint8, ("nrow", "height", "width", 2))  # nothing sends it
   pixels: Array(wp.uint8, ("nrow", "height", "width", 3))
   depth: floats("nrow", "height", "width")
   segmentation: Array(wp.vec2i, ("nrow", "height", "width"))
   labels: Array(wp.uint8, ("nrow", "height", "width"))
   points: Array(wp.vec3, ("nrow", "height", "width"))
+  flow: Array(wp.vec2, ("nrow", "height", "width"))
   soiling: Array(wp.uint8, ("nrow", "height", "width", 2))
 
 
@@ -129,8 +130,8 @@ def see(s: Lens, height: int, width: int):
     return
   h, x, y = float(height), float(j), float(i)
   middle = wp.vec2(0.5 * float(width) - 0.5, 0.5 * h - 0.5)
+  pixel = 2.0 * wp.tan(0.5 * s.fovy[r]) / h
   if wp.length_sq(s.bend[r]) > 0.0:
-    pixel = 2.0 * wp.tan(0.5 * s.fovy[r]) / h
     from_ = straight(s.bend[r], (wp.vec2(x, y) - middle) * pixel) / pixel + middle
     x, y = from_[0], from_[1]
   ni, nj = int(wp.floor(y + 0.5)), int(wp.floor(x + 0.5))
@@ -151,6 +152,11 @@ def see(s: Lens, height: int, width: int):
     s.labels[r, i, j] = wp.uint8(0)
     if inside:
       s.labels[r, i, j] = s.sent_labels[r, ni, nj]
+  if s.flow.shape[0] > 0:
+    s.flow[r, i, j] = wp.vec2()
+    if inside:  # where the lens would have shown it before
+      was = (wp.vec2(x, y) - s.sent_flow[r, ni, nj] - middle) * pixel
+      s.flow[r, i, j] = wp.vec2(float(j), float(i)) - (bent(s.bend[r], was) / pixel + middle)
   film, before = s.film[r], blood(s, r, (wp.vec2(float(j), float(i)) - middle) / h)
   if s.soiling.shape[0] > 0:
     s.soiling[r, i, j, 0] = wp.uint8(255.0 * film[0] + 0.5)

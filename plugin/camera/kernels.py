@@ -128,6 +128,12 @@ class View:
   normal: Array(wp.vec3, ("nrow * stride",))
   lips: Array(wp.uint8, ("nrow", "nsoftface"))  # bits of sides that cuts have opened, and corners
   lip_thing: ints("nsoftface")
+  # All of these before the last `Camera.place`; empty where no flow is asked for.
+  eye_before: Array(wp.vec3, ("nrow",))
+  look_before: Array(wp.mat33, ("nrow",))
+  to_eye_before: Array(wp.mat33, ("nrow", "npart"))
+  from_eye_before: Array(wp.vec3, ("nrow", "npart"))
+  point_before: Array(wp.vec3, ("nrow * stride",))
   # Things.
   rgba: Array(wp.vec4, ("nrow", "nthing"))
   tex: ints("nrow", "nthing")
@@ -161,6 +167,7 @@ class View:
   segmentation: Array(wp.vec2i, ("nrow", "height", "width"))
   labels: Array(wp.uint8, ("nrow", "height", "width"))
   points: Array(wp.vec3, ("nrow", "height", "width"))
+  flow: Array(wp.vec2, ("nrow", "height", "width"))
 
 
 @struct
@@ -309,20 +316,37 @@ def fill(c: View, first: int):
   a, b, e = m[0], m[1], m[2]
   if wp.dot(a, wp.cross(b - a, e - a)) >= 0.0:
     return
-  if wp.max(wp.vec3(-a[2], -b[2], -e[2])) <= c.near:
+  up = wp.tan(0.5 * c.fovy[r])
+  across = up * float(c.width) / float(c.height)
+  x, y, z = wp.vec3(a[0], b[0], e[0]), wp.vec3(a[1], b[1], e[1]), wp.vec3(-a[2], -b[2], -e[2])
+  if wp.max(z) <= c.near or wp.min(z) >= c.far:
     return
-  i0, i1, j0, j1 = wp.int32(0), c.height - 1, wp.int32(0), c.width - 1
-  pixel = 2.0 * wp.tan(0.5 * c.fovy[r]) / float(c.height)
+  if wp.min(x - across * z) > 0.0 or wp.max(x + across * z) < 0.0:
+    return
+  if wp.min(y - up * z) > 0.0 or wp.max(y + up * z) < 0.0:
+    return
+  pixel = 2.0 * up / float(c.height)
+  low, high = wp.vec2(1e9, 1e9), wp.vec2(-1e9, -1e9)
+  for k in range(3):  # the part of each side that is beyond the near plane
+    n = (k + 1) % 3
+    if z[k] > c.near or z[n] > c.near:
+      step = z[n] - z[k]
+      s0, s1 = wp.float32(0.0), wp.float32(1.0)
+      if z[k] < c.near:
+        s0 = (c.near - z[k]) / step
+      if z[n] < c.near:
+        s1 = (c.near - z[k]) / step
+      for end in range(2):
+        s = s0 + float(end) * (s1 - s0)
+        at = wp.vec2(x[k] + s * (x[n] - x[k]), y[k] + s * (y[n] - y[k])) / (z[k] + s * step)
+        low, high = wp.min(low, at), wp.max(high, at)
   half_w, half_h = 0.5 * float(c.width), 0.5 * float(c.height)
-  if wp.min(wp.vec3(-a[2], -b[2], -e[2])) > 0.5 * c.near:
-    x = wp.vec3(-a[0] / a[2], -b[0] / b[2], -e[0] / e[2]) / pixel
-    y = wp.vec3(a[1] / a[2], b[1] / b[2], e[1] / e[2]) / pixel
-    j0 = int(wp.ceil(wp.max(wp.min(x), -half_w) + half_w - 0.501))
-    j1 = int(wp.floor(wp.min(wp.max(x), half_w) + half_w - 0.499))
-    i0 = int(wp.ceil(wp.max(wp.min(y), -half_h) + half_h - 0.501))
-    i1 = int(wp.floor(wp.min(wp.max(y), half_h) + half_h - 0.499))
-    i0, j0 = wp.max(i0, 0), wp.max(j0, 0)
-    i1, j1 = wp.min(i1, c.height - 1), wp.min(j1, c.width - 1)
+  j0 = int(wp.ceil(wp.max(low[0] / pixel, -half_w) + half_w - 0.501))
+  j1 = int(wp.floor(wp.min(high[0] / pixel, half_w) + half_w - 0.499))
+  i0 = int(wp.ceil(half_h - 0.501 - wp.min(high[1] / pixel, half_h)))
+  i1 = int(wp.floor(half_h - 0.499 - wp.max(low[1] / pixel, -half_h)))
+  i0, j0 = wp.max(i0, 0), wp.max(j0, 0)
+  i1, j1 = wp.min(i1, c.height - 1), wp.min(j1, c.width - 1)
   if i0 > i1 or j0 > j1:
     return
   if (i1 - i0 + 1) * (j1 - j0 + 1) > c.little and not clear:
@@ -468,6 +492,28 @@ def normal_of(c: View, r: int, hit: Hit):
 
 
 @wp.func
+def flow_of(c: View, r: int, hit: Hit, pixel: float, at: wp.vec2):
+  """Returns the way of what a pixel shows since before, right and down [pixels].
+
+  It was on the same triangle, with the same weights of its corners.
+  """
+  if hit.face < 0:
+    return wp.vec2()
+  u, v, w, was = hit.u, hit.v, 1.0 - hit.u - hit.v, wp.vec3()
+  if hit.face < c.soft_start:
+    f, p = hit.face, c.part[hit.face]
+    own = c.corner[f, 0] * u + c.corner[f, 1] * v + c.corner[f, 2] * w
+    was = c.from_eye_before[r, p] + c.to_eye_before[r, p] * own
+  else:
+    k = hit.face - c.soft_start
+    i, j, l = c.soft_corner[r, k, 0], c.soft_corner[r, k, 1], c.soft_corner[r, k, 2]
+    own = c.point_before[i] * u + c.point_before[j] * v + c.point_before[l] * w
+    was = wp.transpose(c.look_before[r]) * (own - c.eye_before[r])
+  z = wp.max(-was[2], c.near)
+  return wp.vec2(at[0] - was[0] / z, was[1] / z - at[1]) / pixel
+
+
+@wp.func
 def light(c: View, r: int, thing: int, p: wp.vec3, n: wp.vec3, to_eye: wp.vec3):
   """Returns the light that comes from a place with the normal n."""
   own, gloss = c.rgba[r, thing], c.gloss[thing]
@@ -546,6 +592,8 @@ def draw(c: View, start: int):
     c.points[r, i, j] = wp.vec3()
     if first.face >= 0:
       c.points[r, i, j] = wp.vec3(z * at[0], -z * at[1], z)
+  if c.flow.shape[0] > 0:
+    c.flow[r, i, j] = flow_of(c, r, first, pixel, at)
   if c.segmentation.shape[0] > 0:
     c.segmentation[r, i, j] = wp.vec2i(-1, -1)
     if first.face >= 0:

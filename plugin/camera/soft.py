@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -23,12 +23,10 @@ from palpate.tissue.geometry.mesh import Mesh, vertex_normals
 from palpate.tissue.types import fill
 from scipy.sparse import csr_array, eye_array, hstack
 
+from .host import Seen
 from .kernels import Soft
 from .scene import SEEN, Scene, repeat, skin
 from .shapes import Triangles, smooth
-
-if TYPE_CHECKING:
-  from ..base import Tissue
 
 _OBJ = mujoco.mjtObj
 _FAINT = 1e-3  # weights of vertices that a smooth surface does without
@@ -76,7 +74,7 @@ class Surface:
     base: vertices at rest [m]                 (nvert, 3)
   """
 
-  def __init__(self, tissue: Tissue, model: mujoco.MjModel, scene: Scene, detail: int):
+  def __init__(self, tissue: Seen, model: mujoco.MjModel, scene: Scene, detail: int):
     self.tissue, space = tissue, tissue.space
     self._organ = organ = space.organ
     self._mesh: Mesh = organ.mesh
