@@ -369,7 +369,7 @@ def choose(names: Sequence[str] | None, size: Any) -> Choice:
 
 
 def _known() -> str:
-  return ", ".join((*GROUPS, TRUTH, *PICTURES)) + " or single observations"
+  return ", ".join((*GROUPS, *PICTURES, TRUTH)) + " or single observations"
 
 
 def check(task: Any, physics: Physics) -> None:

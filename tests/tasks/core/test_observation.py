@@ -28,7 +28,9 @@ def test_the_camera_is_that_of_the_points():
   assert len(world) and np.linalg.norm(world - site, axis=1).max() < 0.005
 
 
-@pytest.mark.parametrize("name, count", [("grasp/easy", 4), ("bimanual/easy", 8)])
+@pytest.mark.parametrize(
+  "name, count", [("grasp/easy", 4), pytest.param("bimanual/easy", 8, marks=pytest.mark.slow)]
+)
 def test_key_points_are_where_instruments_are(name, count):
   env = load(name, "keypoints", "points", "segmentation")
   env.reset()
