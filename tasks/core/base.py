@@ -398,9 +398,9 @@ class Task(engine.Task):
     if self.cost.damage:
       self.outcome, self.progress = "damage", -1.0
       where = max(beside, key=lambda name: beside[name])
-      by = "" if tip > self.damage else f" by the {where}"
-      force = tip if tip > self.damage else beside[where]
-      self.event(physics, "note", label=f"damage{by}: {force:.2f} N")
+      how = " by the shaft" if where == "shaft" else " on the surroundings"
+      how, force = ("", tip) if tip > self.damage else (how, beside[where])
+      self.event(physics, "note", label=f"too much force{how}: {force:.2f} N")
     elif self.outcome == "success":
       self.event(physics, "note", label="success")
     self.shaping = self.rules.shaping(physics, self) if self.rules else 0.0

@@ -22,7 +22,7 @@ from .score import CONSECUTIVE, FLOOR, PASSING, REPEATS, SUCCESS, WEIGHTS, Score
 _MOST_EVENTS = 50
 _ENDS = {
   SUCCESS: "Success",
-  "damage": "Failed: a force above what the tissue bears",
+  "damage": "Failed: tissue was harmed",
   "missed": "Failed: reported a wrong place",
   "time limit": "Failed: the time ran out",
   "stopped": "Stopped before the end",
@@ -92,6 +92,9 @@ def ending(recording: Recording) -> str:
   if outcome is None:
     return "How it ended was not recorded"
   words = _ENDS.get(outcome, f"Failed: {outcome}")
+  notes = [event for event in recording.events if event.kind == "note" and event.label]
+  if outcome == "damage" and notes:  # the exercise's, of what harmed it
+    words = f"Failed: {notes[-1].label}"
   if len(recording.time):
     words += f", after {number(float(recording.time[-1] - recording.time[0]))} s"
   return f"{words}: {recording.info['error']}" if "error" in recording.info else words

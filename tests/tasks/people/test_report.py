@@ -186,7 +186,7 @@ def test_what_the_expert_has_and_the_recording_lacks_is_shown():
 @pytest.mark.parametrize(
   ("outcome", "said"),
   [
-    ("damage", "Failed: a force above what the tissue bears, after 2 s"),
+    ("damage", "Failed: tissue was harmed, after 2 s"),
     ("time limit", "Failed: the time ran out, after 2 s"),
     ("missed", "Failed: reported a wrong place, after 2 s"),
     ("stopped", "Stopped before the end, after 2 s"),
@@ -210,6 +210,14 @@ def test_the_head_says_what_happened_and_a_failure_is_at_the_floor(outcome, said
   text = _Page(report.render(recorder.recording(), make_reference(again, "touch", 0))).text()
   assert "How it ended was not recorded" in text
   assert "No composite score : the recording does not say how it ended" in text
+
+
+def test_the_head_says_what_harmed_tissue():
+  recorder = _recorder()
+  recorder.event("note", 2.0, label="torn by a pull of 1.20 N")
+  recorder.info["outcome"] = "damage"
+  text = _Page(report.render(recorder.recording())).text()
+  assert "Failed: torn by a pull of 1.20 N, after 2 s" in text[: text.index("Metrics")]
 
 
 def test_a_film_is_in_the_page():
