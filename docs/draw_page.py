@@ -48,14 +48,14 @@ LOOK = """(() => {
 MOVE = """move => window.program.send(JSON.stringify(
   {type: "hand", which: "right", move, rate: [0, 0, 0, 0], buttons: []}))"""
 DEEP, HIGH = -0.004, 0.012  # of a blade over the line [m]
-CUT = 12  # marks along which it cuts
+CUT = 10  # marks along which it cuts
 
 
 def cut(page) -> None:
   """Cuts along the beginning of a line, as a hand does."""
   targets = np.array(page.evaluate(LOOK)["targets"])[:CUT, :3]
   stations = [(targets[0], HIGH, 2e-3, 100), (targets[0], DEEP, 6e-4, 60)]
-  for place, high, step, most in stations + [(each, DEEP, 8e-4, 25) for each in targets[1:]]:
+  for place, high, step, most in stations + [(each, DEEP, 4e-4, 40) for each in targets[1:]]:
     for _ in range(most):
       now = page.evaluate(LOOK)
       way = place + np.array([0, 0, high]) - now["tip"]
