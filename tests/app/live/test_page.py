@@ -29,6 +29,20 @@ WATCH = """(() => {
 PAD = "window.pads = []; navigator.getGamepads = () => window.pads;"
 
 
+# What the page plays, as a recording: the page's own contexts are replaced by ones without a card.
+RECORD = """
+window.heard = [];
+window.AudioContext = class extends OfflineAudioContext {
+  constructor() { super(1, 22050, 44100); window.heard.push(this); }
+};
+"""
+HEARD = """async () => {
+  const [context] = window.heard;
+  return context ? [...(await context.startRendering()).getChannelData(0)] : [];
+}"""
+TONES = {"force": (880, 0.1), "shaft": (660, 0.1), "view": (330, 0.15), "end": (523, 0.3)}
+
+
 class Pages:
   """A server, a browser, and one page that the tests share."""
 
@@ -179,6 +193,26 @@ def test_an_exercise_is_done_through_the_page(pages, tmp_path):
   kept = max(pages.folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
   assert Recording.load(kept).outcome == "success" and pathlib.Path(kept).parent == pages.folder
   pages.speed("1")
+
+
+@pytest.mark.parametrize("kind", TONES)
+def test_a_tone_is_what_is_heard(pages, kind):
+  """Recorded by the browser: pitch, loudness and length; nothing where the sound is off."""
+  page = pages.page.context.browser.new_page()
+  page.add_init_script(RECORD)
+  page.goto(f"{pages.server.url}card.js")  # any file: the modules are beside it
+  speak = "async ([kind, on]) => (await import('/sounds.js')).speaker(() => on)(kind)"
+  page.evaluate(speak, [kind, False])
+  assert page.evaluate(HEARD) == []
+  page.evaluate(speak, [kind, True])
+  wave, (pitch, length) = np.array(page.evaluate(HEARD)), TONES[kind]
+  on = np.flatnonzero(np.abs(wave) > 1e-3)
+  assert (on[-1] - on[0]) / 44100 == pytest.approx(length, abs=0.004)
+  sound = wave[on[0] : on[-1]]
+  assert np.sqrt((sound**2).mean()) == pytest.approx(0.2 / np.sqrt(2), rel=0.06)
+  spectrum = np.abs(np.fft.rfft(sound * np.hanning(len(sound)), 2**17))
+  assert spectrum.argmax() * 44100 / 2**17 == pytest.approx(pitch, abs=1.0)
+  page.close()
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@ import {kept, show} from "./card.js";
 import {CLOCK, Hand} from "./hand.js";
 import * as home from "./home.js";
 import {Plot} from "./plots.js";
+import {speaker} from "./sounds.js";
 import {language, speak, t} from "./texts.js";
 import {PRACTICE, Tutorial} from "./tutorial.js";
 import {View} from "./view.js";
@@ -15,7 +16,6 @@ const WORDS = 100;  // between numbers in words, which are laid out anew [ms]
 const ENOUGH = 40, PROMPT = 0.9;  // frames to judge by whether most of them are drawn
 const LONGEST = 100;  // that a picture lies behind what came [ms]
 const KEPT = 5000;  // of the times from hand to picture
-const TONES = {force: [880, 0.1], shaft: [660, 0.1], view: [330, 0.15], end: [523, 0.3]};  // [Hz], [s]
 
 const asked = new URLSearchParams(location.hash.slice(1));
 speak();
@@ -28,7 +28,7 @@ try {
 }
 let offer = null;  // of the program: exercises, devices, ...
 let tutorial = null;
-let scene = null, frame = null, head = {}, rest = null, running = false, paused = false, sound = null;
+let scene = null, frame = null, head = {}, rest = null, running = false, paused = false;
 let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble = "", warned = "", late = null;
 let last = null, arrived = 0, span = 0, mixed = null;  // frames between which pictures lie [ms]
 let waited = false;  // for a movement
@@ -380,17 +380,7 @@ function mix(share) {
   return mixed;
 }
 
-function beep(kind) {
-  if (!$("sound").checked) return;
-  sound ??= new AudioContext();
-  const tone = sound.createOscillator(), gain = sound.createGain(), [pitch, length] = TONES[kind] ?? TONES.force;
-  document.body.dataset.tone = kind;  // for those who do not hear it, and for tests
-  tone.frequency.value = pitch;
-  gain.gain.value = 0.2;
-  tone.connect(gain).connect(sound.destination);
-  tone.start();
-  tone.stop(sound.currentTime + length);
-}
+const beep = speaker(() => $("sound").checked);
 
 // The buttons.
 

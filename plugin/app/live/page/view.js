@@ -66,7 +66,7 @@ export class View {
     this.papers?.forEach(paper => paper.dispose());
     this.scene = scene;
     this.elem = this.lips = this.opened = null;
-    this.shades = {value: Array.from({length: 2 * SHADES}, () => new THREE.Vector3(9, 9, 9))};
+    this.shades = {value: scene.tips.slice(0, SHADES).flatMap(() => [new THREE.Vector3(9, 9, 9), new THREE.Vector3(9, 9, 9)])};
     this.world = new THREE.Scene();
     this.world.background = new THREE.Color(0x120505);
     this.papers = new Map(Object.entries(scene.textures).map(([key, value]) => [Number(key), paper(value)]));
@@ -476,15 +476,18 @@ function normals(x, t, out) {
 
 // Darkens a surface softly near the capsules of `shades`: pairs of ends, in the world.
 function shade(material, shades) {
+  const count = shades.value.length / 2;
+  if (!count) return material;
+  material.customProgramCacheKey = () => `shades ${count}`;
   material.onBeforeCompile = shader => {
     shader.uniforms.shades = shades;
     shader.vertexShader = `varying vec3 shadeAt;\n${shader.vertexShader}`.replace(
       "#include <project_vertex>", "#include <project_vertex>\n\tshadeAt = (modelMatrix * vec4(transformed, 1.0)).xyz;");
     shader.fragmentShader = `varying vec3 shadeAt;
-uniform vec3 shades[${2 * SHADES}];
+uniform vec3 shades[${2 * count}];
 float shadeOf() {
 \tfloat near = 1.0;
-\tfor (int i = 0; i < ${SHADES}; i++) {
+\tfor (int i = 0; i < ${count}; i++) {
 \t\tvec3 along = shades[2 * i + 1] - shades[2 * i], from = shadeAt - shades[2 * i];
 \t\tfloat far = distance(from, along * clamp(dot(from, along) / max(dot(along, along), 1e-9), 0.0, 1.0)) / ${SOFT};
 \t\tnear = min(near, 1.0 - exp(-0.5 * far * far));
