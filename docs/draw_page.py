@@ -31,6 +31,7 @@ STATES = {
   "cut": (WIDE, "[data-task='cut/standard']", {}, False),
   "card": (WIDE, "[data-task='touch/easy']", {"d": 300}, True),
   "practice": (WIDE, "#tab-practice", {}, False),
+  "line": (WIDE, "#tab-practice", {}, False),
   "phone": (PHONE, "[data-task='trace/easy']", {"d": 200}, False),
   "phone_home": (PHONE, None, {}, False),
 }
@@ -67,26 +68,40 @@ def cut(page) -> None:
       page.wait_for_timeout(50)
 
 
+def line(page) -> None:
+  """Draws a line on the organ with the mouse."""
+  page.click("#draw")
+  for k, turn in enumerate(np.linspace(-0.9, 1.2, 40)):
+    page.mouse.move(400 + 110 * np.sin(turn), 380 + 120 * np.sin(2 * turn))
+    if not k:
+      page.mouse.down()
+  page.mouse.up()
+  page.click("#draw")
+
+
+HANDS = {"cut": cut, "line": line}
+
+
 def draw(browser, url: str, name: str) -> None:
   """Writes the picture of a state."""
   (width, height), start, keys, stopped = STATES[name]
   phone = (width, height) == PHONE
   page = browser.new_page(viewport={"width": width, "height": height}, has_touch=phone)
   page.add_init_script(LISTEN)
-  page.goto(url if name == "cut" else f"{url}#look=wet")  # a hand does not wait for pictures
+  page.goto(url if name in HANDS else f"{url}#look=wet")  # a hand does not wait for pictures
   page.wait_for_selector(".card", timeout=ANSWER)
   if phone:
     page.evaluate("document.body.classList.add('touch')")
   if start:
     page.click(start)
-    if name == "practice":
+    if start == "#tab-practice":
       page.select_option("#organ", "gallbladder")
       page.select_option("#instrument", "scalpel")
       page.click("#start")
     page.wait_for_selector("#stop:enabled", timeout=ANSWER)
     page.wait_for_timeout(3000)
-  if name == "cut":
-    cut(page)
+  if name in HANDS:
+    HANDS[name](page)
   for key, held in keys.items():
     page.focus("#view")
     page.keyboard.down(key)

@@ -215,6 +215,34 @@ def test_a_tone_is_what_is_heard(pages, kind):
   page.close()
 
 
+# A triangle that is drawn on from above and lifted by a centimetre; a tip touches beside the line.
+DRAW = """async () => {
+  const {Line} = await import("/line.js"), {Scene} = await import("/three/three.module.min.js");
+  const line = new Line(new Scene()), x = new Float32Array([0, 0, 0, 0.1, 0, 0, 0, 0.1, 0]);
+  const down = [0, 0, -1];
+  for (let k = 0; k < 9; k++) line.add([0.01 + 0.003 * k, 0.02, 0.1], down, x, [0, 1, 2]);
+  line.add([0.034, 0.0201, 0.1], down, x, [0, 1, 2]);  // too near to the last one
+  line.add([0.2, 0.2, 0.1], down, x, [0, 1, 2]);  // beside the organ
+  for (const k of [2, 5, 8]) x[k] = 0.01;
+  line.drape(x);
+  const tip = {tip_x: 0.022, tip_y: 0.022, tip_z: 0.01};
+  const follow = force => line.measure({...tip, force});
+  return [line.at, line.dots.count, follow(0), follow(0.1)];
+}"""
+
+
+def test_a_line_lies_on_the_tissue_and_is_followed(pages):
+  page = pages.page.context.browser.new_page()
+  page.goto(f"{pages.server.url}card.js")
+  at, count, before, after = page.evaluate(DRAW)
+  assert count == len(at) == 9
+  expected = [[0.01 + 0.003 * k, 0.02, 0.01] for k in range(9)]
+  np.testing.assert_allclose(at, expected, atol=1e-7)
+  assert before == [0, 0]
+  assert after == [pytest.approx(1 / 9), pytest.approx(0.002, abs=1e-6)]
+  page.close()
+
+
 @pytest.mark.slow
 def test_too_much_force_and_a_lost_tip_are_seen_and_heard(pages):
   """Each in a colour and with a tone of its own, and noted in the recording."""

@@ -82,6 +82,7 @@ export class Hand {
     if (event.isTrusted) canvas.setPointerCapture(event.pointerId);
     if (event.pointerType === "touch") document.body.classList.add("touch");
     this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    if (this.view.pen) this.view.write(event);
     this.grip = event.button === 2 && !this.view.free;
     this.aside = event.button === 2 || event.shiftKey;
   }
@@ -89,6 +90,7 @@ export class Hand {
   drag(event) {
     const last = this.fingers.get(event.pointerId);
     if (!last) return;
+    if (this.view.pen) return this.view.write(event);
     const [x, y] = [event.clientX - last[0], event.clientY - last[1]], view = this.view;
     const before = this.span();
     this.since ??= event.timeStamp;

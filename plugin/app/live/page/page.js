@@ -126,6 +126,7 @@ const HEAR = {
     for (const button of document.querySelectorAll("[data-tilt]")) button.hidden = !scene.scope && !scene.turns;
     hand.turns = scene.turns;
     hand.begin();
+    press("draw", false);
     if (!scene.scope) press("scope", false);
     else if (on("follow")) say({type: "follow", on: true});
     run(true);
@@ -307,6 +308,10 @@ function take(numbers) {
   told = performance.now();
   const lesson = tutorial?.look(head, scene.camera), done = Math.max(lesson ? lesson[1] : head.progress, 0);
   if (lesson) $("instruction").textContent = lesson[0];
+  else if (view.line.points.length) {
+    const [share, far] = view.line.measure(head);
+    $("instruction").textContent = t("The line: {0} % followed, {1} mm off on average", Math.round(100 * share), (1e3 * far).toFixed(1));
+  }
   $("force-text").textContent = t("{0} N, limit {1} N", head.force.toFixed(2), limit);
   $("progress").value = done;
   $("progress-text").textContent = `${Math.round(100 * done)} %`;
@@ -397,6 +402,10 @@ const toggle = (id, act) => $(id).onclick = () => {
 };
 toggle("scope", down => hand.scope = down);
 toggle("follow", down => running && say({type: "follow", on: down}));
+toggle("draw", down => {
+  view.pen = down;
+  if (down) view.line?.clear();
+});
 toggle("wire", on => view.wire = on);
 toggle("free", on => {
   view.free = on;

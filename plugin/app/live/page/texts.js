@@ -7,7 +7,7 @@ const GERMAN = {
   "More": "Mehr", "device of the hand": "Gerät der Hand", "device of the other hand": "Gerät der anderen Hand", "speed": "Tempo",
   "scale of movements": "Maßstab der Bewegungen", "seed": "Startzahl", "time step": "Zeitschritt", "sound": "Ton", "computed on": "rechnet auf",
   "language": "Sprache", "Start": "Start", "Pause": "Pause", "Resume": "Weiter", "Stop": "Ende", "Free view": "Freie Sicht", "Wireframe": "Netz",
-  "Show me": "Zeig es mir", "Move the camera": "Kamera bewegen", "Camera follows": "Kamera folgt", "device of the laparoscope": "Gerät des Laparoskops",
+  "Show me": "Zeig es mir", "Draw a line": "Linie zeichnen", "The line: {0} % followed, {1} mm off on average": "Die Linie: {0} % verfolgt, im Mittel {1} mm daneben", "Move the camera": "Kamera bewegen", "Camera follows": "Kamera folgt", "device of the laparoscope": "Gerät des Laparoskops",
   "keys and buttons of this page": "Tasten und Knöpfe dieser Seite", "turn the camera left": "Kamera links drehen", "turn the camera right": "Kamera rechts drehen",
   "Deeper": "Tiefer", "Back": "Zurück", "Grip": "Greifen", "Here": "Hier", "Clutch": "Kuppeln", "roll left": "links drehen",
   "roll right": "rechts drehen", "Force": "Kraft", "Force [N]": "Kraft [N]", "Progress": "Fortschritt", "Time": "Zeit",

@@ -2,6 +2,7 @@
 // things are; what a laparoscope adds to that, its lamp, wet surfaces and smoke, is made here.
 import * as THREE from "./three/three.module.min.js";
 import {Blood} from "./blood.js";
+import {Line} from "./line.js";
 import {unpack} from "./numbers.js";
 
 const BODY = 12, SITE = 19;  // numbers of each in a frame
@@ -28,7 +29,7 @@ export class View {
     this.gl.toneMappingExposure = 1.15;
     this.camera = new THREE.PerspectiveCamera(45, 1, NEAR, FAR);
     this.camera.matrixAutoUpdate = false;
-    this.wire = this.free = false;
+    this.wire = this.free = this.pen = false;
     this.wet = !this.slow;  // wet tissue and mirrors, or what is fast to draw
     this.mirror = this.wet ? reflections(this.gl) : null;
     this.home();
@@ -43,9 +44,9 @@ export class View {
 
   // What the picture depends on beside the frame.
   state() {
-    const {canvas, wire, free, turn, shift, zoom, smoke, blood} = this;
+    const {canvas, wire, free, turn, shift, zoom, smoke, blood, line} = this;
     const smoking = smoke?.some(puff => puff.visible) || blood?.flows ? performance.now() : 0;
-    return JSON.stringify([canvas.clientWidth, canvas.clientHeight, wire, free, turn, shift, zoom, smoking]);
+    return JSON.stringify([canvas.clientWidth, canvas.clientHeight, wire, free, turn, shift, zoom, smoking, line?.points.length]);
   }
 
   scale(factor) {
@@ -94,6 +95,7 @@ export class View {
     });
     this.world.add(...this.parts, ...this.marks);
     this.blood = new Blood(this.world, this.wet);
+    this.line = new Line(this.world);
     this.weave(scene.organ);
     this.lead();
     this.smoke = Array.from({length: PUFFS}, () => {
@@ -223,6 +225,7 @@ export class View {
     this.show(expert, head);
     this.fume(head.current > 0, frame, places);
     this.stain();
+    this.line.drape(this.nodes);
     this.gl.render(this.world, camera);
   }
 
@@ -327,6 +330,15 @@ export class View {
       puff.scale.setScalar(0.004 + 0.014 * age);
       puff.material.opacity = 0.4 * Math.max(1 - age / 1.6, 0);
     }
+  }
+
+  // Draws on to the organ where a pointer is, in pixels of the page.
+  write({clientX, clientY}) {
+    const {canvas, camera, nodes, elem, line} = this, box = canvas.getBoundingClientRect();
+    const x = 2 * (clientX - box.left) / box.width - 1, y = 1 - 2 * (clientY - box.top) / box.height;
+    const from = new THREE.Vector3().setFromMatrixPosition(camera.matrix);
+    const to = new THREE.Vector3(x, y, 0.5).applyMatrix4(camera.projectionMatrixInverse).applyMatrix4(camera.matrix);
+    if (nodes) line.add(from.toArray(), to.sub(from).toArray(), nodes, elem);
   }
 
   // Blood and char go with the vertices of the mesh; what is drawn smooth lies close to these.
