@@ -193,7 +193,8 @@ class Batch(abc.ABC):
       width: the same
       outputs: some of `pixels` (red, green, blue, uint8), `depth` [m], `segmentation` (number and
         `mjtObj` of what is seen, -1 for nothing), `points` [m] (in the camera's frame, x right, y
-        down, z forward; 0 where nothing is)
+        down, z forward; 0 where nothing is), `flow` (way of what a pixel shows since the last
+        picture, right and down [pixels])
       worlds: which ones; None for all
 
     Raises:

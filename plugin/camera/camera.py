@@ -102,7 +102,7 @@ class Camera:
       Surface(tissue, model, self.scene, detail) for tissue in batch.organs.values()
     ]
     self._surfaces = [each for each in self._surfaces if each.nvert]
-    self._refuse_crowd(size, outputs)
+    self._refuse_crowd(size, outputs, 2 if through else 1)
     values = self._allocate(size, outputs)
     values["shift"] = np.zeros(len(self.worlds)) if shift is None else np.array(shift, float)
     values |= self._things(labels) | self._parts() | self._organs(values)
@@ -116,9 +116,9 @@ class Camera:
 
   # Making.
 
-  def _refuse_crowd(self, size: tuple[int, int], outputs: Sequence[str]):
-    """Raises ValueError where there is no room for so many pictures."""
-    pixel = sum(
+  def _refuse_crowd(self, size: tuple[int, int], outputs: Sequence[str], times: int):
+    """Raises ValueError where there is no room for so many pictures, each kept so many times."""
+    pixel = times * sum(
       wp.types.type_size_in_bytes(dtype) * int(np.prod(more))
       for dtype, more in (OUTPUTS[name] for name in outputs)
     )
@@ -278,7 +278,7 @@ class Camera:
     return dict(
       near=float(m.vis.map.znear) * extent, far=float(m.vis.map.zfar) * extent, xpos=xpos,
       xmat=xmat, cam_body=int(self._bodies[m.cam_bodyid[camera]]),
-      eye=self._rows(np.zeros(3)), look=self._rows(np.eye(3)),
+      pixel=self._rows(0.0), eye=self._rows(np.zeros(3)), look=self._rows(np.eye(3)),
       seed=np.arange(len(self.worlds), dtype=np.int32),
       lamp_kind=np.array([lamp["kind"] for lamp in lamps], np.int32),
       lamp_body=np.array(body, np.int32), fade=np.array([lamp["fade"] for lamp in lamps]),

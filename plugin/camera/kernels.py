@@ -97,6 +97,7 @@ class View:
   cam_pos: Array(wp.vec3, ("nrow",))  # in the frame of the body [m]
   cam_mat: Array(wp.mat33, ("nrow",))
   fovy: floats("nrow")  # [rad]
+  pixel: floats("nrow")  # size of a pixel at the distance 1
   shift: floats("nrow")  # of the lens to the right, for stereo [m]
   seed: ints("nrow")  # another one in each picture
   eye: Array(wp.vec3, ("nrow",))  # in the world
@@ -186,6 +187,7 @@ def aim(c: View):
   r = wp.tid()
   c.seed[r] += 1
   c.nlarge[r] = 0
+  c.pixel[r] = 2.0 * wp.tan(0.5 * c.fovy[r]) / float(c.height)
   w, b = c.world[r], c.cam_body
   look = c.xmat[w, b] * c.cam_mat[r]
   c.eye[r] = c.xpos[w, b] + c.xmat[w, b] * c.cam_pos[r] + look * wp.vec3(c.shift[r], 0.0, 0.0)
@@ -214,8 +216,7 @@ def put(c: View):
   c.from_eye[r, p] = place
   radius = ball[3] * wp.max(size)
   m = place + mat * wp.vec3(ball[0], ball[1], ball[2])
-  up = wp.tan(0.5 * c.fovy[r])
-  across = up * float(c.width) / float(c.height)
+  up, across = 0.5 * float(c.height) * c.pixel[r], 0.5 * float(c.width) * c.pixel[r]
   seen = wp.int32(1)
   if c.part_thing[p] >= 0:
     alpha = c.rgba[r, c.part_thing[p]][3]
@@ -316,8 +317,8 @@ def fill(c: View, first: int):
   a, b, e = m[0], m[1], m[2]
   if wp.dot(a, wp.cross(b - a, e - a)) >= 0.0:
     return
-  up = wp.tan(0.5 * c.fovy[r])
-  across = up * float(c.width) / float(c.height)
+  pixel, half_w, half_h = c.pixel[r], 0.5 * float(c.width), 0.5 * float(c.height)
+  up, across = half_h * pixel, half_w * pixel
   x, y, z = wp.vec3(a[0], b[0], e[0]), wp.vec3(a[1], b[1], e[1]), wp.vec3(-a[2], -b[2], -e[2])
   if wp.max(z) <= c.near or wp.min(z) >= c.far:
     return
@@ -325,7 +326,6 @@ def fill(c: View, first: int):
     return
   if wp.min(y - up * z) > 0.0 or wp.max(y + up * z) < 0.0:
     return
-  pixel = 2.0 * up / float(c.height)
   low, high = wp.vec2(1e9, 1e9), wp.vec2(-1e9, -1e9)
   for k in range(3):  # the part of each side that is beyond the near plane
     n = (k + 1) % 3
@@ -340,7 +340,6 @@ def fill(c: View, first: int):
         s = s0 + float(end) * (s1 - s0)
         at = wp.vec2(x[k] + s * (x[n] - x[k]), y[k] + s * (y[n] - y[k])) / (z[k] + s * step)
         low, high = wp.min(low, at), wp.max(high, at)
-  half_w, half_h = 0.5 * float(c.width), 0.5 * float(c.height)
   j0 = int(wp.ceil(wp.max(low[0] / pixel, -half_w) + half_w - 0.501))
   j1 = int(wp.floor(wp.min(high[0] / pixel, half_w) + half_w - 0.499))
   i0 = int(wp.ceil(half_h - 0.501 - wp.min(high[1] / pixel, half_h)))
@@ -565,7 +564,7 @@ def draw(c: View, start: int):
   i, j = tile / across * 4 + k / 8, tile % across * 8 + k % 8
   if i >= c.height or j >= c.width or not c.chosen[r]:
     return
-  pixel = 2.0 * wp.tan(0.5 * c.fovy[r]) / float(c.height)
+  pixel = c.pixel[r]
   at = ray_of(c, pixel, i, j)
   d = c.look[r] * wp.vec3(at[0], at[1], -1.0)  # a distance along it is one from the camera's plane
   o = c.eye[r]

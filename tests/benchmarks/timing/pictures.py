@@ -3,10 +3,10 @@
     palpate bench pictures --device cuda:0
 
 `camera` draws the laparoscope's picture of an exercise in its abdomen in every world, what moved
-brought up to date before: bodies, organs' vertices and normals, and their trees. `exercise` takes
+brought up to date before: bodies, organs' vertices and normals. `exercise` takes
 control steps of the vectorised exercise with random actions, with and without `pixels`.
 `mujoco_warp` is its renderer on the same device, of the same surroundings as meshes and of the
-organ's skin as a flex, beside a tool of 14 shapes; its trees are refitted before each picture too.
+organ's skin as a flex, beside a tool of 14 shapes; its trees are refitted before each picture.
 On CUDA work is replayed from a graph.
 """
 
