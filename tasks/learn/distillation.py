@@ -26,7 +26,7 @@ from .sight import PICTURES
 
 TEACHER = "teacher"  # group of observations
 STEPS = 64  # control steps of an iteration
-UPDATES, WORLDS = 32, 32  # steps of the optimiser of an iteration, and worlds of each
+UPDATES, WORLDS = 32, 64  # steps of the optimiser of an iteration, and worlds of each
 _KEPT = 4  # iterations that are learned from
 _ALONE = 1 / 3  # share of worlds where the student acts alone, once it acts
 _TURN = 40  # control steps of a turn elsewhere, in the mean
@@ -79,7 +79,7 @@ class Distillation(Student):
     self._kept: collections.deque[dict[str, Any]] = collections.deque(maxlen=_KEPT)
     self._random = torch.Generator(device).manual_seed(settings.seed)
     self._alone = torch.arange(self.env.num_envs, device=device) < _ALONE * self.env.num_envs
-    self._helped = torch.ones_like(self._alone)
+    self._helped, self._left = torch.ones_like(self._alone), False
     self.env.stagger(torch.Generator().manual_seed(settings.seed))
 
   @property
@@ -115,7 +115,7 @@ class Distillation(Student):
     for _ in range(UPDATES):
       self.update()
     self.steps += STEPS * self.env.num_envs
-    return float(self.env.won[self._alone].mean())
+    return float(self.env.won[self._alone].mean()) if self._left else 0.0
 
   @torch.no_grad()
   def _collect(self, ended: list, stop: Callable[[], bool]) -> dict[str, torch.Tensor] | None:
@@ -127,6 +127,8 @@ class Distillation(Student):
     size = env.num_envs, self.settings.memory
     first = torch.zeros(size, device=env.device) if state is None else state[0].clone()
     begun = torch.zeros(env.num_envs, device=env.device)
+    if self.iteration and self._done > _ACTS / 2 and not self._left:  # alone from now on
+      self._left, env.won[self._alone], env.whole[self._alone] = True, 0.0, False
     for _ in range(STEPS):
       if stop():
         return None
@@ -145,11 +147,11 @@ class Distillation(Student):
       drawn = torch.rand(2, env.num_envs, generator=self._random, device=env.device)
       again = over.bool() | (drawn[0] < 1 / _TURN)
       self._helped = torch.where(again, drawn[1] < helps, self._helped)
-      if self.iteration and self._done > _ACTS / 2:
+      if self._left:
         self._helped &= ~self._alone
     return {name: torch.stack(values) for name, values in rows.items()} | {"state": first}
 
-  def update(self) -> float:
+  def update(self) -> torch.Tensor:
     """Takes a step of the optimiser, by some worlds of an iteration; returns the error."""
     which, device = int(torch.randint(len(self._kept), ())), self.env.device
     count = self.env.num_envs
@@ -166,7 +168,7 @@ class Distillation(Student):
     loss.backward()
     torch.nn.utils.clip_grad_norm_([p for p in actor.parameters() if p.grad is not None], 1.0)
     self.optimiser.step()
-    return float(loss.detach())
+    return loss.detach()
 
   def _remember(self, part: Mapping[str, torch.Tensor], state: torch.Tensor) -> torch.Tensor:
     """Returns the actor's memory in each step, beginning with a state; an episode has its own."""
