@@ -109,7 +109,7 @@ def test_a_policy_of_pictures_learns_from_one_of_the_state_and_is_evaluated(
   folder = tmp_path / "a"
   assert train(folder, *PICTURES, "--iterations", "1") == 0
   assert train(folder, *PICTURES, "--iterations", "3", "--resume") == 0
-  monkeypatch.setattr("palpate.app.learn.train._JUDGE", 1)
+  monkeypatch.setattr("palpate.app.learn.train.JUDGE", 1)
   assert train(folder, *PICTURES, "--iterations", "9", "--resume", "--success", "0") == 0  # judged
   assert [row["iteration"] for row in rows(folder)] == [1, 2, 3]
   about = policy.load(folder / "policy.safetensors").about

@@ -37,7 +37,7 @@ _TRAINED = "trained"  # the teacher that comes with an exercise
 _SAVE = 60.0  # seconds between checkpoints
 ROUNDS = 6  # of lessons, at most
 _LESSONS = 96  # of a round
-_JUDGE = 5  # iterations between looks at the policy without spread
+JUDGE = 5  # iterations between looks at the policy without spread
 _LICENCE = """SPDX-License-Identifier: Apache-2.0
 
 The weights in this folder are licensed under the Apache License, version 2.0, as Palpate is, in
@@ -273,7 +273,7 @@ def _enough(
   if learner.iteration >= args.iterations or learner.seconds >= 60 * args.minutes:
     return True
   # With the spread of learning a policy may succeed that alone does not.
-  wins = rows and rows[-1]["success"] >= args.success and learner.iteration % _JUDGE == 0
+  wins = rows and rows[-1]["success"] >= args.success and learner.iteration % JUDGE == 0
   return bool(wins) and learner.judge(stop) >= args.success
 
 
