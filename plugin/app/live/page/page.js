@@ -123,7 +123,7 @@ const HEAR = {
     $("pad-grip").hidden = !scene.jaws;
     $("pad-report").hidden = !scene.report;
     $("scope").hidden = $("follow").hidden = !scene.scope;
-    for (const button of document.querySelectorAll("[data-tilt]")) button.hidden = !scene.scope && !scene.turns;
+    tilts();
     hand.turns = scene.turns;
     hand.begin();
     press("draw", false);
@@ -389,6 +389,10 @@ const beep = speaker(() => $("sound").checked);
 
 // The buttons.
 
+// Buttons that turn a camera are there while one is moved.
+function tilts() {
+  for (const button of document.querySelectorAll("[data-tilt]")) button.hidden = !hand.scope && !scene?.turns;
+}
 const pressed = (id, on) => $(id).setAttribute("aria-pressed", on);
 const on = id => $(id).getAttribute("aria-pressed") === "true";
 function press(id, down) {
@@ -400,7 +404,10 @@ const toggle = (id, act) => $(id).onclick = () => {
   act(on);
   $("view").focus();
 };
-toggle("scope", down => hand.scope = down);
+toggle("scope", down => {
+  hand.scope = down;
+  tilts();
+});
 toggle("follow", down => running && say({type: "follow", on: down}));
 toggle("draw", down => {
   view.pen = down;

@@ -7,7 +7,7 @@ const GERMAN = {
   "More": "Mehr", "device of the hand": "Gerät der Hand", "device of the other hand": "Gerät der anderen Hand", "speed": "Tempo",
   "scale of movements": "Maßstab der Bewegungen", "seed": "Startzahl", "time step": "Zeitschritt", "sound": "Ton", "computed on": "rechnet auf",
   "language": "Sprache", "Start": "Start", "Pause": "Pause", "Resume": "Weiter", "Stop": "Ende", "Free view": "Freie Sicht", "Wireframe": "Netz",
-  "Show me": "Zeig es mir", "Draw a line": "Linie zeichnen", "The line: {0} % followed, {1} mm off on average": "Die Linie: {0} % verfolgt, im Mittel {1} mm daneben", "Move the camera": "Kamera bewegen", "Camera follows": "Kamera folgt", "device of the laparoscope": "Gerät des Laparoskops",
+  "Show me": "Zeig es mir", "Draw a line": "Linie zeichnen", "The line: {0} % followed, {1} mm off on average": "Die Linie: {0} % verfolgt, im Mittel {1} mm daneben", "Camera": "Kamera", "Follow": "Folgen", "device of the laparoscope": "Gerät des Laparoskops",
   "keys and buttons of this page": "Tasten und Knöpfe dieser Seite", "turn the camera left": "Kamera links drehen", "turn the camera right": "Kamera rechts drehen",
   "Deeper": "Tiefer", "Back": "Zurück", "Grip": "Greifen", "Here": "Hier", "Clutch": "Kuppeln", "roll left": "links drehen",
   "roll right": "rechts drehen", "Force": "Kraft", "Force [N]": "Kraft [N]", "Progress": "Fortschritt", "Time": "Zeit",
@@ -19,8 +19,8 @@ const GERMAN = {
     "Tasten: Pfeile oder W A S D bewegen im Bild, Q weg und E heran, Z und X drehen. G schließt die Backen, R meldet, C kuppelt, P hält an, H zeigt die Könnerin.",
   "Gamepad: the left stick moves across the picture, the right stick sets depth and roll. The first button grips, the second reports, the third is the clutch.":
     "Gamepad: der linke Stick bewegt im Bild, der rechte stellt Tiefe und Drehung. Der erste Knopf greift, der zweite meldet, der dritte kuppelt.",
-  "Laparoscope: I J K L move it across the picture, U in and O out, N and M roll the scope, V and B turn the camera. F lets it follow the tip. With Y, or Move the camera, everything above moves the laparoscope.":
-    "Laparoskop: I J K L bewegen es im Bild, U hinein und O heraus, N und M drehen die Optik, V und B die Kamera. Mit F folgt es der Spitze. Mit Y, oder Kamera bewegen, bewegt alles Obige das Laparoskop.",
+  "Laparoscope: I J K L move it across the picture, U in and O out, N and M roll the scope, V and B turn the camera. F lets it follow the tip. With Y, or Camera, everything above moves the laparoscope.":
+    "Laparoskop: I J K L bewegen es im Bild, U hinein und O heraus, N und M drehen die Optik, V und B die Kamera. Mit F folgt es der Spitze. Mit Y, oder Kamera, bewegt alles Obige das Laparoskop.",
   "Free view: drag to rotate the picture. Two fingers, or Shift and drag, pan it. The wheel or a pinch zooms. Keys and gamepad still move the instrument.":
     "Freie Sicht: ziehen dreht das Bild. Zwei Finger, oder Umschalt und ziehen, schieben es. Rad oder Spreizen vergrößert. Tasten und Gamepad bewegen weiter das Instrument.",
   // Home.
