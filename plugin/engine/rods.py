@@ -32,7 +32,10 @@ CORE, NEIGHBOURS = 0.5, 3.5
 _MOST_PAIRS = 32  # of edges near each other, for one node
 _SOFT = 0.05  # modulus across a thread over that along it, an estimate
 _SLOW = 1e-4  # velocity below which friction within a thread is viscous [m/s]
-_MUJOCOS = ("jacobian", "flex_margin", "qvel", "qacc_warmstart")
+_MUJOCOS = (
+  *("jacobian", "flex_margin", "qvel", "qacc_warmstart"),
+  *("M_rowadr", "M_rownnz", "M_colind"),
+)
 _HUGE = 1e6  # more than any twist [rad]
 
 
@@ -65,7 +68,7 @@ class Rod:
   qposadr: ints("nnode")  # its first number in qpos
   bodyid: ints("nnode")  # its body
   massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
-  diagonal: ints("nv")  # where M has the diagonal of a dof
+  solution: doubles("nv")  # scratch
   own_dof: ints("nv")  # number of a dof in the rod: three times the node, and the axis; or -1
   frame: doubles(3, 3)  # rotation from the slides' axes to the world
   # A step:
@@ -103,6 +106,9 @@ class Rod:
   flex_margin: doubles("nflex")
   qvel: doubles("nv")
   qacc_warmstart: doubles("nv")
+  M_rowadr: ints("nv")
+  M_rownnz: ints("nv")
+  M_colind: ints("nC")
 
 
 _CONSTANTS = contacts.CONSTANTS | {"CORE": CORE, "NEIGHBOURS": NEIGHBOURS}
@@ -262,7 +268,7 @@ class Workspace:
       qposadr=organ.qposadr,
       bodyid=organ.body,
       massadr=np.where(organ.free[:, None], coupling.mass_addresses(m, dofs), -1),
-      diagonal=coupling.mass_addresses(m, np.arange(m.nv)),
+      solution=np.zeros(m.nv),
       own_dof=own_dof,
       frame=organ.frame,
       **{name: np.zeros((n, 3)) for name in ("start", "vel", "external", "aim", "place")},

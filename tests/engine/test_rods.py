@@ -195,6 +195,41 @@ def test_a_thread_around_a_drum_obeys_the_capstan_law(friction, cone, kind):
   assert tension[-1] / tension[0] == pytest.approx(np.exp(friction * np.pi), rel=0.03)
 
 
+@pytest.mark.parametrize("mass", [1e-4, 2e-2])
+def test_a_needle_swings_on_its_thread(mass):
+  """Let go from beside the point that it hangs on; a node weighs 0.2 mg."""
+  n = 41
+  world = f"""<body name="needle" pos=".08 0 0"><freejoint/><geom type="capsule" size=".0004"
+    fromto="0 0 0 .012 0 0" mass="{mass}" contype="0" conaffinity="0"/></body>"""
+  after = f"""<equality><connect body1="needle" body2="t_{n - 1}" anchor="0 0 0" solref=".002 1"/>
+    </equality>"""
+  model, data, thread = load(line(n, 0.08), pin=(0,), world=world, after=after, bend=0.02)
+  weight, most, low = 9.81 * (mass + MASS), 0.0, 0.0
+  for _ in range(400):
+    run(model, data, 1)
+    mujoco.mj_kinematics(model, data)
+    most = max(most, thread.tension.max())
+    low = min(low, data.body("needle").xpos[2])
+    assert np.linalg.norm(thread.positions[-1] - data.body("needle").xpos) < 1e-3
+  assert low == pytest.approx(-0.08, rel=0.02)
+  assert 2 * weight < most < 20 * weight  # a point pulls with 3 weights; this is jerked as it turns
+  assert thread.error is None
+
+
+def test_forward_twice_changes_nothing():
+  motion = []
+  for extra in (0, 2):
+    model, data, _ = capstan(0.3, "pyramidal")
+    force(model, data, 0, (0, 0, -0.1))
+    data.ctrl[0] = 0.01
+    for _ in range(40):
+      for _ in range(extra):
+        mujoco.mj_forward(model, data)
+      run(model, data, 1)
+    motion.append(data.qpos.copy())
+  np.testing.assert_array_equal(motion[0], motion[1])
+
+
 def test_a_thread_comes_to_rest_on_a_floor():
   world = '<geom type="plane" size="1 1 .1" pos="0 0 -.002"/>'
   model, data, thread = load(line(41, 0.08), world=world)

@@ -5,11 +5,11 @@
 //
 //   qfrc_passive = Mhat (v1 - v) / h - f_ext - f_c,
 //
-// with f_c the force of the constraints in the rod's step and Mhat the inertia that one node alone has
-// in it. MuJoCo's solver, for which Mhat is the nodes' inertia, finds f_c again unless other bodies move
-// otherwise; by what it differs the rod then moves on by its own response. Too great an inertia does no harm
-// here: with A the rod's own and M the body's, an error of a body's motion becomes (Mhat - A) / (M + Mhat)
-// of it, less than 1.
+// with f_c the force of the constraints in the rod's step and Mhat the inertia that one node alone has in it.
+// MuJoCo's solver, for which Mhat is the nodes' inertia, finds f_c again unless other bodies move otherwise; by
+// what it differs the rod then moves on by its own response A. An error of a body of mass M becomes
+// (A - Mhat) / (M + Mhat) of it, and one of the rod Mhat M / ((M + Mhat) A): so Mhat is that of the direction in
+// which the rod gives way most.
 #pragma once
 #include "coupling/contact_rows.h"
 #include "coupling/node.h"
@@ -32,6 +32,27 @@ PALPATE int first_node(const Fields& f, Row row) {
   return last - first > 1 ? -1 : first;
 }
 
+// How other bodies give way to a row's force, J M^-1 J^T of their dofs [1/kg], by MuJoCo's factors of M. A row
+// that has a dof has those above it, on which alone its part of the solution depends.
+template <class Fields>
+PALPATE double yields(const Fields& f, Row row) {
+  double* x = f.solution.data;
+  const auto own = [&](int k) { return f.own_dof.data[row.dof ? row.dof[k] : k] >= 0; };
+  for (int k = 0; k < row.count; ++k) x[row.dof ? row.dof[k] : k] = own(k) ? 0.0 : row.value[k];
+  for (int k = row.count - 1; k >= 0; --k) {
+    const int i = row.dof ? row.dof[k] : k, start = f.M_rowadr.data[i], last = f.M_rownnz.data[i] - 1;
+    if (x[i] == 0.0) continue;
+    for (int c = 0; c < last; ++c) x[f.M_colind.data[start + c]] -= f.mj.qLD.data[start + c] * x[i];
+  }
+  // M = L^T D L: with y = L^-T J, J M^-1 J^T is y^T D^-1 y.
+  double sum = 0.0;
+  for (int k = 0; k < row.count; ++k) {
+    const int i = row.dof ? row.dof[k] : k;
+    sum += x[i] * x[i] * f.mj.qLDiagInv.data[i];
+  }
+  return sum;
+}
+
 // Notes MuJoCo's row `r` where it acts on the rod; returns whether it does.
 template <class Fields>
 PALPATE bool note_row(const Fields& f, int r, int kind, double friction) {
@@ -43,36 +64,45 @@ PALPATE bool note_row(const Fields& f, int r, int kind, double friction) {
   const double* kbip = datum<double*>(f, DATA_EFC_KBIP) + 4 * r;
   const double gap = datum<double*>(f, DATA_EFC_POS)[r] - datum<double*>(f, DATA_EFC_MARGIN)[r];
   double sum = kbip[1] * velocity(f, r) + kbip[0] * kbip[2] * gap;  // -aref
-  double yields = 0.0;  // how another body gives way to the row's force [1/kg]
   for (int k = 0; k < DOFS; ++k) J[k] = 0.0;
   for (int k = 0; k < row.count; ++k) {
     if (row.value[k] == 0.0) continue;
     const int dof = row.dof ? row.dof[k] : k, own = f.own_dof.data[dof];
     if (own >= 0)
       J[own - 3 * node] = row.value[k];
-    else {
+    else
       sum += row.value[k] * f.qacc_warmstart.data[dof];
-      yields += row.value[k] * row.value[k] / f.mj.M.data[f.diagonal.data[dof]];
-    }
-  }
-  double D = datum<double*>(f, DATA_EFC_D)[r];
-  if (kind == BOTH) {  // its last acceleration is without the row's last force, then it yields to the new one
-    double before = 0.0, length2 = 0.0;
-    for (int k = 0; k < DOFS; ++k) {
-      if (J[k] == 0.0) continue;
-      before += J[k] * f.own.force.data[3 * node + k];
-      length2 += J[k] * J[k];
-    }
-    sum -= yields * before / length2;
-    D /= 1.0 + D * yields;
   }
   J[DOFS] = sum;
-  J[DOFS + 1] = D;
+  J[DOFS + 1] = datum<double*>(f, DATA_EFC_D)[r];
   J[DOFS + 2] = friction;
   f.row_node.data[at] = node;
   f.row_kind.data[at] = kind;
   f.count.data[0] = at + 1;
   return true;
+}
+
+// Notes the rows of an equality, from `r` on. What it joins to the rod does not go on as it did: from its last
+// acceleration the row's last force is taken off, and it gives way to the new one. It does so by as much as in all
+// rows together, no less than in any direction: too little would overshoot.
+template <class Fields>
+PALPATE void note_equality(const Fields& f, int r, int count) {
+  const int from = f.count.data[0];
+  double way = 0.0;
+  for (int k = 0; k < count; ++k)
+    if (note_row(f, r + k, BOTH, 0.0)) way += yields(f, row_of(f, r + k));
+  for (int at = from; at < f.count.data[0]; ++at) {
+    double* J = f.row_value.data + (DOFS + 3) * at;
+    const double* last = f.own.force.data + 3 * f.row_node.data[at];
+    double before = 0.0, length2 = 0.0;
+    for (int k = 0; k < DOFS; ++k) {
+      if (J[k] == 0.0) continue;
+      before += J[k] * last[k];
+      length2 += J[k] * J[k];
+    }
+    J[DOFS] -= way * before / length2;
+    J[DOFS + 1] /= 1.0 + J[DOFS + 1] * way;
+  }
 }
 
 template <class Fields>
@@ -104,8 +134,11 @@ PALPATE void note_rows(const Fields& f) {
     }
   }
   const int* type = datum<int*>(f, DATA_EFC_TYPE);
-  for (int r = 0; r < nefc; ++r) {
-    if (type[r] == IS_EQUALITY) note_row(f, r, BOTH, 0.0);
+  const int* id = datum<int*>(f, DATA_EFC_ID);
+  for (int r = 0, count = 1; r < nefc; r += count) {
+    for (count = 1; type[r] == IS_EQUALITY && r + count < nefc && type[r + count] == IS_EQUALITY && id[r + count] == id[r];)
+      ++count;
+    if (type[r] == IS_EQUALITY) note_equality(f, r, count);
     if (type[r] == IS_LIMIT) note_row(f, r, ONE, 0.0);
   }
 }
@@ -142,18 +175,14 @@ PALPATE Envelope inverse_of(const Fields& f) {
   return {f.inverse.data, f.first.data, f.start_of_row.data, 4 * f.nnode};
 }
 
-// The inertia along the axes that a node alone has in the rod's step, from the inverse of its matrix; no less
-// than its mass. With the diagonal of the node's matrix times 3/2, no direction has more than twice it.
+// An inertia of a node alone in the rod's step that is no more than in any direction, and no less than a third of
+// the least, from the inverse of the rod's matrix; no less than its mass.
 template <class Fields>
-PALPATE D3 alone(const Fields& f, int i, double h) {
-  constexpr double SURE = 1.5;
-  const Envelope Z = inverse_of(f);
-  D3 row[3];
-  for (int a = 0; a < 3; ++a)
-    row[a] = {Z.at(4 * i + a, 4 * i), Z.at(4 * i + a, 4 * i + 1), Z.at(4 * i + a, 4 * i + 2)};
-  const double det = dot(row[0], cross(row[1], row[2])), scale = SURE * h * h / det, mass = f.mass.data[i];
-  const D3 found = {scale * cross(row[1], row[2]).x, scale * cross(row[2], row[0]).y, scale * cross(row[0], row[1]).z};
-  return vmax(found, {mass, mass, mass});
+PALPATE double alone(const Fields& f, int i, double h) {
+  double trace = 0.0;
+  for (int c = 0; c < 3; ++c) trace += inverse_of(f).at(4 * i + c, 4 * i + c);
+  const double found = h * h / trace, mass = f.mass.data[i];
+  return found > mass ? found : mass;
 }
 
 // Takes the rod's step, and adds the passive force that brings it through MuJoCo's.
@@ -183,7 +212,10 @@ PALPATE void begin_rod(const Fields& f, Thread, int) {
     if (adr < 0) continue;
     const int* at = f.massadr.data + 3 * i;
     D3 Mhat = {mj.M.data[at[0]], mj.M.data[at[1]], mj.M.data[at[2]]};
-    if (touched) set_inertia(mj, at, adr, Mhat = alone(f, i, h));
+    if (touched) {
+      const double inertia = alone(f, i, h);
+      set_inertia(mj, at, adr, Mhat = {inertia, inertia, inertia});
+    }
     const D3 dv = (1.0 / h) * (load(f.place.data + 3 * i) - load(f.start.data + 3 * i)) - load(f.vel.data + 3 * i);
     const D3 rate = (1.0 / h) * D3{Mhat.x * dv.x, Mhat.y * dv.y, Mhat.z * dv.z};
     double* out = mj.qfrc_passive.data + adr;
