@@ -77,7 +77,8 @@ class Worlds(Batch):
       for o, t, n in zip(declared, tools, nslots, strict=True)
     )
     bare, slots = strip_organs.strip(spec, model, declared, nslots)
-    self._kept, self.bare, self._graphs = strip_organs.kept(model, declared), bare, {}
+    self._kept, self.bare = strip_organs.kept(model, declared), bare
+    self._graphs: dict[str, tuple[Any, Any]] = {}
     with wp.ScopedDevice(target):
       self._put(bare, nslots, tools, deterministic, spaces)
       self._allocate()

@@ -118,7 +118,7 @@ def test_pictures_change():
   wide = seen({"camera_fovy": (20, 20)})["segmentation"] == observation.LABELS["organ"]
   assert wide.mean() < 0.8 * organ.mean()
   other = seen({"texture": (15, 15)})["pixels"].astype(float) - plain["pixels"]
-  assert 2 < np.abs(other[organ]).mean() < 30  # 0.5 with the first texture: the marker moves
+  assert 2 < np.abs(other[organ]).mean() < 30  # below 1 with the first texture: the marker moves
   turned = seen({"camera_turn": (5, 5)})["segmentation"] == observation.LABELS["organ"]
   moved = seen({"camera_pos": (0.02, 0.02)})["segmentation"] == observation.LABELS["organ"]
   assert turned.shape == (height, width)
