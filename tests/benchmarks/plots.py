@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pathlib
 from collections.abc import Sequence
 
@@ -20,6 +21,10 @@ STYLES = {
   "native, right weights": ("#f4a582", "D", "--"),
   "native, Newton": ("#8c564b", "P", "-"),
 }
+# Of curves and bars: the colour-blind tell them apart too (Okabe and Ito 2008).
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+MARKS = "osD^vPX"
+MANY = 16  # names of bars that stand in one column
 
 
 def grid(rows: int, columns: int, width: float, height: float):
@@ -64,19 +69,23 @@ def curves(
   ylabel: str,
 ) -> pathlib.Path:
   """Draws lines on logarithmic axes and returns the path: panel by panel, line by line (x, y)."""
-  columns = max(1, len(panels))
-  figure, axes = grid(1, columns, 3.6 * columns + 2.0, 3.6)
-  for ax, (name, lines) in zip(axes, panels.items(), strict=False):
-    for label, (x, y) in lines.items():
-      ax.plot(x, y, "o-", ms=4, label=label)
-    ax.set_title(name, loc="left", fontsize=9)
+  columns = min(max(1, len(panels)), 2)
+  rows = -(-max(1, len(panels)) // columns)
+  figure, axes = grid(rows, columns, 4.6 * columns + 1.0, 3.8 * rows)
+  for ax, (name, lines) in itertools.zip_longest(axes.ravel(), panels.items(), fillvalue=("", {})):
+    ax.set_visible(bool(name) or len(panels) < 2)
+    for k, (label, (x, y)) in enumerate(lines.items()):
+      colour, mark = COLOURS[k % len(COLOURS)], MARKS[k % len(MARKS)]
+      ax.plot(x, y, "-", marker=mark, ms=5, color=colour, label=label)
+    ax.set_title(name, loc="left", fontsize=11)
     ax.set(xlabel=xlabel)
     if lines:
       ax.set(xscale="log", yscale="log")
       plain(ax.xaxis)
       plain(ax.yaxis)
-      ax.legend(frameon=False, fontsize=7)
-  axes[0].set_ylabel(ylabel)
+      ax.legend(frameon=False, fontsize=9)
+  for row in axes if rows > 1 else [axes]:
+    row[0].set_ylabel(ylabel)
   return save(figure, path, title)
 
 
@@ -84,23 +93,33 @@ def bars(
   path: pathlib.Path, title: str, names: Sequence[str], groups: dict[str, Sequence], xlabel: str
 ) -> pathlib.Path:
   """Draws horizontal bars and returns the path: a line a name, a colour a group."""
-  figure, (ax,) = grid(1, 1, 7.6, 0.14 * len(names) * (len(groups) + 0.6) + 1.4)
+  columns = 2 if len(names) > MANY else 1
+  tall = -(-len(names) // columns)
+  height = 0.16 * tall * (len(groups) + 0.6) + 1.4
+  figure, axes = grid(1, columns, 9.2 if columns > 1 else 7.6, height)
   width = 0.8 / max(1, len(groups))
-  for k, (label, values) in enumerate(groups.items()):
-    at = [i + width * (k - (len(groups) - 1) / 2) for i in range(len(names))]
-    ax.barh(at, values, 0.9 * width, label=label)
-  ax.set_yticks(range(len(names)), names)
-  ax.invert_yaxis()
-  ax.axvline(0, color=INK, lw=0.8)
-  ax.set_xlabel(xlabel)
+  for c, ax in enumerate(axes):
+    mine = slice(c * tall, (c + 1) * tall)
+    for k, (label, values) in enumerate(groups.items()):
+      at = [i + width * (k - (len(groups) - 1) / 2) for i in range(len(names[mine]))]
+      colour = COLOURS[k % len(COLOURS)]
+      ax.barh(at, values[mine], 0.9 * width, color=colour, label=label)
+    ax.set_yticks(range(len(names[mine])), names[mine])
+    ax.set_ylim(tall - 0.4, -0.6)
+    ax.axvline(0, color=INK, lw=0.8)
+    ax.set_xlabel(xlabel)
+  low, high = min(ax.get_xlim()[0] for ax in axes), max(ax.get_xlim()[1] for ax in axes)
+  for ax in axes:
+    ax.set_xlim(low, high)
   if len(groups) > 1:
-    ax.legend(frameon=False, fontsize=8)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
   return save(figure, path, title)
 
 
 def save(figure, path: pathlib.Path, title: str) -> pathlib.Path:
   """Writes a figure and returns its path."""
-  figure.suptitle(title, fontsize=10, color=INK, x=0.01, ha="left")
+  figure.suptitle(title, fontsize=11, color=INK, x=0.01, ha="left")
   figure.savefig(path)
   return path
 
