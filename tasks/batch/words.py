@@ -67,9 +67,15 @@ def peak(s: Common):
 
 
 @word
+def tissue_force(s: Common):
+  """See `rules`."""
+  return kernels.vector(s.tissue_force, s.world)
+
+
+@word
 def force(s: Common):
   """See `rules`."""
-  return wp.length(kernels.vector(s.tissue_force, s.world))
+  return wp.length(tissue_force(s))
 
 
 @word

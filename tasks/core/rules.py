@@ -189,7 +189,12 @@ def peak(s: Any) -> float:
 
 def force(s: Any) -> float:
   """Returns the force of tissue on the instrument below the shaft [N]."""
-  return length(s.tissue_force())
+  return length(tissue_force(s))
+
+
+def tissue_force(s: Any) -> np.ndarray:
+  """Returns the force of tissue on the instrument below the shaft [N]."""
+  return s.tissue_force()
 
 
 def from_tip(s: Any, place: np.ndarray) -> np.ndarray:

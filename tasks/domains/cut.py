@@ -6,10 +6,13 @@ that is cut [-]; `deviation` (1,), largest distance of the cut from the line so 
 
 Progress: 0.1 * closeness to the line, at its best, + 0.9 * share of the line that is cut. A point
 of the line is cut where the edge has gone through the wall within the tolerance of it, slower than
-60 mm/s; moving along without cutting counts nothing. Success: 98 % of it, and the piece is free, or
-6 mm more are cut than the line is long: the mesh may hang together by an edge. Failure: more than
-10 mm cut farther from the line than the tolerance or faster, a force above the damage limit, or the
-time limit.
+60 mm/s and without dragging: with a pull along the sheet, which its frame holds, of at most twice
+what cutting takes. Moving along without cutting counts nothing. Success: 98 % of it, and the piece
+is free, or 6 mm more are cut than the line is long: the mesh may hang together by an edge. Failure:
+more than 10 mm cut farther from the line than the tolerance, faster or dragging, a pull of twice
+its limit, a force above the damage limit, or the time limit.
+
+The sheet is under tension, so that the cut gapes. The line is that of the tissue at rest.
 
 That is the pattern cut of FLS: a circle of 4 cm, and all of the cut within 2 mm of the line (Ritter
 and Scott 2007, 10.1177/1553350607302329), with a scalpel in place of scissors and a grasper.
@@ -44,6 +47,7 @@ from ..core.rules import (
   root,
   rows,
   tip,
+  tissue_force,
   vector,
 )
 from ..core.scenes import Scene
@@ -57,7 +61,8 @@ SCENE = Scene(
   camera=(-0.03, -0.07, 0.09),
 )
 RULE = 0.002  # [m], of FLS
-ASTRAY = 0.01  # most that may be cut beyond the tolerance, or slashed [m]
+ASTRAY = 0.01  # most that may be cut beyond the tolerance, slashed or dragged [m]
+TRACTION = 0.5  # limit of the pull along the sheet, of which cutting takes 0.24 [N]
 SLASH = 0.06  # speed from which on a cut is a slash: nobody stops it at the line [m/s]
 COVERED = 0.98  # share of the line that is to be cut
 CLOSING = 0.006  # length that is cut beyond that of the line where the piece counts as free [m]
@@ -112,6 +117,7 @@ class State:
 
   control_timestep: float  # [s]
   tolerance: float  # [m]
+  limit: float  # of the pull along the sheet [N]
   count: int  # points of the line
   curve: Annotated[Any, Array(wp.vec3, ("room",))]  # these [m]
   cut: Annotated[Any, ints("room")]  # whether they are cut
@@ -119,12 +125,14 @@ class State:
   next: int  # the first that is not, after those that are
   length: float  # of the line [m]
   opened: float  # length that was cut so far [m]
-  astray: float  # length of that beyond the tolerance, or slashed [m]
+  astray: float  # length of that beyond the tolerance, slashed or dragged [m]
   jagged: float  # length of that more than 2 mm from the line [m]
   excess: float  # area between cut and line [m^2]
   mean: float  # distance of the cut from the line [m]
   farthest: float  # largest [m]
   deepest: float  # how far the tip was under the sheet while it cut [m]
+  traction: float  # pull along the sheet [N]
+  pulled: float  # the largest so far [N]
   inside: bool  # whether the edge was in the tissue a control step ago
   seat: Vector  # where it was then [m]
   travelled: float  # and how far it had come [m]
@@ -189,6 +197,12 @@ def cover(o, first, last):
   return o
 
 
+def pull(s):
+  """Returns the pull along the sheet, which lies in z = 0 [N]."""
+  force = tissue_force(s)
+  return root(force[0] * force[0] + force[1] * force[1])
+
+
 def proceed(s, o, start, end, way):
   """Counts a piece of the cut, between two places at rest [m]."""
   first, before = nearest(o, start)
@@ -201,7 +215,7 @@ def proceed(s, o, start, end, way):
   o.farthest = max(o.farthest, off)
   if off > RULE:
     o.jagged = o.jagged + way
-  if off > o.tolerance or way > SLASH * o.control_timestep:
+  if off > o.tolerance or way > SLASH * o.control_timestep or o.traction > o.limit:
     o.astray = o.astray + way
   else:
     o = cover(o, first, last)
@@ -210,6 +224,8 @@ def proceed(s, o, start, end, way):
 
 def advance(s, o):
   """Follows the edge through the tissue."""
+  o.traction = pull(s)
+  o.pulled = max(o.pulled, o.traction)
   inside, travelled, seat = cutter(s)
   if inside and travelled > o.travelled:
     o = proceed(s, o, o.seat if o.inside else seat, seat, travelled - o.travelled)
@@ -217,7 +233,7 @@ def advance(s, o):
   o.inside = inside
   o.seat = seat
   o.travelled = travelled
-  if o.astray > ASTRAY:
+  if o.astray > ASTRAY or o.traction > 2.0 * o.limit:
     return o, -1.0, DAMAGED
   if o.covered >= COVERED and (o.opened > o.length + CLOSING or pieces(s) > 1):
     return o, 1.0, SUCCESS
@@ -259,6 +275,7 @@ class Cut(Task):
       "cut_excess": "excess",
       "cut_jagged": "jagged",
       "cut_depth": "deepest",
+      "peak_traction": "pulled",
     },
     mark=mark,
   )
@@ -272,6 +289,7 @@ class Cut(Task):
     radius: float,
     wave: float = 0.0,
     tolerance: float = RULE,
+    traction: float = TRACTION,
     **kwargs,
   ):
     """Makes the task.
@@ -283,6 +301,7 @@ class Cut(Task):
       radius: of the line [m]
       wave: by how much that comes and goes, three times around [-]
       tolerance: largest distance of the cut from the line [m]
+      traction: limit of the pull along the sheet [N]
       **kwargs: see Task
     """
     self.targets = MARKS
@@ -292,7 +311,9 @@ class Cut(Task):
       )
     if not 0 < tolerance < radius:
       raise ValueError(f"{name}: tolerance is {tolerance}, expected a number in (0, {radius})")
-    self.radius, self.wave, self.tolerance = radius, wave, tolerance
+    if not traction > 0:
+      raise ValueError(f"{name}: traction is {traction}, expected a number > 0 [N]")
+    self.radius, self.wave, self.tolerance, self.limit = radius, wave, tolerance, traction
     self.room = len(line(radius, wave, 0.0)[0]) + 4  # another may have a point or two more
     kwargs = {"force_limit": 0.8, "damage": 2.0, **kwargs}
     super().__init__(dataclasses.replace(scene, targets=MARKS), random, name=name, **kwargs)
@@ -310,7 +331,7 @@ class Cut(Task):
     self.curve, self.length = line(self.radius, self.wave, self.random.uniform(0, 2 * np.pi))
     self.count, self.cut = len(self.curve), np.zeros(len(self.curve), bool)
     self.opened = self.astray = self.jagged = self.excess = self.mean = self.farthest = 0.0
-    self.deepest = 0.0
+    self.deepest = self.traction = self.pulled = 0.0
     self.inside, self.travelled, self.seat = cutter(physics)
     self.done, self.next, self.covered, self.nearest = 0, 0, 0.0, 0.0
     self.distance0 = distance(physics, self)
@@ -321,9 +342,11 @@ class Cut(Task):
 
   def label(self, kind: str) -> str:
     """Returns what damage is."""
-    return (
-      f"{1e3 * self.astray:.0f} mm are cut beside the line or slashed" if kind == "damage" else ""
-    )
+    if kind != "damage":
+      return super().label(kind)
+    if self.astray > ASTRAY:
+      return f"{1e3 * self.astray:.0f} mm are cut beside the line, slashed or dragged"
+    return f"torn by a pull of {self.traction:.2f} N"
 
   def instruct(self, physics: Physics) -> str:
     """Says to begin, or to go on."""
@@ -335,6 +358,7 @@ class Cut(Task):
     """Returns how the cut is so far."""
     own = {"deviation": self.mean, "farthest": self.farthest}
     own |= {"excess": self.excess, "jagged": self.jagged, "depth": self.deepest}
+    own |= {"traction": self.traction}
     return dict(super().recorded(physics)) | own
 
   def constants(self, physics: Physics) -> dict[str, np.ndarray]:

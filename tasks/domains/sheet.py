@@ -14,8 +14,10 @@ from ..core.scenes import Scene
 SIZE = 0.06  # of its sides [m]
 ENERGY = 160.0  # that it takes to open an area [J/m^2]; catalogue and source: docs/cutting.md
 _SPARE = 5.0  # times the square root of its nodes: room for a cut around and one astray
-# Ours: a firm sheet on a centimetre of fat of 10 kPa, of 6 g.
-_TISSUE = {"young": 1e6, "thickness": 0.0015, "damping": 0.005, "foundation": 1e6}
+# Ours: a firm sheet on a centimetre of fat of 10 kPa, of 6 g. It is stretched by 4 %, so that a cut
+# gapes: tension is E t 0.04 / (1 - nu).
+_TISSUE = {"young": 1e6, "thickness": 0.0015, "tension": 110.0}
+_TISSUE |= {"damping": 0.005, "foundation": 1e6}
 _MASS, _SKIN = 0.006, 0.0005  # [kg], radius of the flex [m]
 # What lies around: the wall, and fat of its own; ours.
 _HELD = situs.Arrangement(without=(*catalog.DUCTS, "fat"))

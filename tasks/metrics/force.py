@@ -226,10 +226,11 @@ def peak_surroundings_force(surroundings_force: ArrayLike) -> float:
 
 @metric("Peak traction", "N", "safety", "max", "as peak force: Horeman et al. 2010")
 def peak_traction(traction: ArrayLike) -> float:
-  """Returns the largest pull on what an organ is bonded to [N], lower is better.
+  """Returns the largest pull on what holds an organ [N], lower is better.
 
   Args:
-    traction: magnitude of the bonds' sum [N]  (nstep,)
+    traction: magnitude of the sum of its bonds, or of the force along a sheet that its rim holds
+      [N]  (nstep,)
   """
   return float(rows("traction", traction).max())
 

@@ -92,7 +92,7 @@ def compare_metrics(told, k, expected):
     ("dissect/easy", 1, 245, {"wanted": 0.2}),
     ("tease/easy", 1, 76, {}),
     ("bimanual/easy", 1, 230, {"wanted": 0.03}),
-    ("cut/easy", 1, 260, {"radius": 0.006}),
+    ("cut/easy", 1, 266, {"radius": 0.006}),
     ("navigate/hard", 1, 153, {"variants": (None,), "marks": 1, "hold": 0.1, "follow": 0.3}),
   ],
 )
