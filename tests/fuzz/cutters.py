@@ -62,6 +62,9 @@ def scene(seed: int):
   keys |= {"pin": np.flatnonzero(held)} if random.rand() < 0.7 else {"foundation": 1e4}
   keys |= {"young": 10 ** random.uniform(3.8, 5.5), "bend": float(random.randint(2))}
   keys |= {"damping": float(random.choice([0.0, 0.002, 0.02])), "thickness": 2e-3}
+  # Half are stretched, by up to 5 %; drawn apart, so that seeds keep the rest.
+  stretch = max(0.0, np.random.RandomState([seed, 2]).uniform(-0.05, 0.05))
+  keys["tension"] = stretch * keys["young"] * keys["thickness"] / (1 - 0.45)
   windows = bool(random.randint(2))
   palpate.add_organ(spec, (points, elem), "organ", windows=windows, spare=300, device="cpu",
                     mass=0.02, **keys)  # fmt: skip
