@@ -99,20 +99,23 @@ def finding(judged: dict[str, list[Row]]) -> list[str]:
   won = {name: _share(rows, lambda r: r["outcome"] == score.SUCCESS)
          for name, rows in judged.items()}  # fmt: skip
   worst = min(won, key=lambda name: won[name])
-  count = sum(map(len, judged.values()))
-  passed = _share(
-    [r for rows in judged.values() for r in rows], lambda r: int(r["proficient"] or 0)
-  )
+  counted = _counted([r for rows in judged.values() for r in rows])
+  passed = _share(counted, lambda r: int(r["proficient"]))
   return [
     f"{sum(share == 100 for share in won.values())} of {len(won)} policies succeed in every "
     f"episode, {sum(share >= 90 for share in won.values())} in 90 % or more.",
     f"`{worst}` succeeds least often, in {won[worst]:.0f} %.",
-    f"{passed:.0f} % of all {count} episodes are proficient by the experts' limits.",
+    f"{passed:.0f} % of {len(counted)} episodes are proficient by the experts' limits.",
   ]
 
 
 def _share(rows: list[Row], which) -> float:
-  return 100 * sum(bool(which(r)) for r in rows) / len(rows)
+  return 100 * sum(bool(which(r)) for r in rows) / max(len(rows), 1)
+
+
+def _counted(rows: list[Row]) -> list[Row]:
+  """Returns the episodes that limits were there for."""
+  return [row for row in rows if str(row["proficient"]) != ""]
 
 
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
@@ -145,7 +148,9 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   title = "Policies that were trained"
   picture = plots.bars(out / "policies.png", "Policies that ship", list(judged), {
     "success": [_share(rows, lambda r: r["outcome"] == score.SUCCESS) for rows in judged.values()],
-    "proficient": [_share(rows, lambda r: int(r["proficient"] or 0)) for rows in judged.values()],
+    "proficient": [
+      _share(_counted(rows), lambda r: int(r["proficient"])) for rows in judged.values()
+    ],
   }, "share of the episodes [%]")  # fmt: skip
   return [picture, results.page(out / "policies.md", title, about, lines, finding(judged), picture)]
 
@@ -154,12 +159,13 @@ def _line(name: str, rows: list[Row]) -> list[str]:
   won = [row for row in rows if row["outcome"] == score.SUCCESS]
   ends = collections.Counter(row["outcome"] for row in rows if row["outcome"] != score.SUCCESS)
   over = collections.Counter(metric for row in won for metric in str(row.get("over", "")).split())
-  passed = sum(int(row["proficient"] or 0) for row in rows)
+  counted = _counted(rows)
+  passed = f"{_share(counted, lambda r: int(r['proficient'])):.0f} %" if counted else "-"
   time = f"{np.mean([float(row['time_s']) for row in won]):.1f}" if won else "-"
   first = rows[0]
   return [
     name, str(first["lessons"]), f"{float(first['train_s']):.0f}", first.get("began_with") or "-",
-    f"{len(won)} of {len(rows)}", f"{100 * passed / len(rows):.0f} %", time,
+    f"{len(won)} of {len(rows)}", passed, time,
     ", ".join(f"{end} {count}" for end, count in sorted(ends.items())) or "-",
     ", ".join(f"{metric.replace('_', ' ')} {n}" for metric, n in over.most_common(3)) or "-",
   ]  # fmt: skip
