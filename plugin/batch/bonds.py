@@ -56,7 +56,10 @@ class Bonds(abc.ABC):
 
   @property
   def stretch(self) -> wp.array:
-    """How far each was from what it leads to as the last step began [m], (nworld, n, 3)."""
+    """How far each was from what it leads to as the last step began [m], (nworld, n, 3).
+
+    It is 0 in a world that was reset, until that steps.
+    """
     self._tell()
     return self._stretch
 

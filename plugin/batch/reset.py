@@ -11,6 +11,7 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
+from palpate.forces.cohesive_bonds import Bonds
 
 from . import kernels
 from .base import on_device
@@ -54,6 +55,7 @@ class Rest:
     for organ in batch.organs.values():
       self.starts += [_start(array) for array in organ.motion.values()]
       zero += [organ.body.state.dvel, organ.patch.stirred]
+      zero += [group.arrays["stretch"] for group in organ.forces.of(Bonds).groups]
     self._rows = self.starts + [_start(array) for array in zero if array.size]
     self._move = move = kernels.Move()
     for name in kernels.Move.vars:

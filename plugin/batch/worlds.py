@@ -89,8 +89,8 @@ class Worlds(Batch):
         name: Organ(self, w, s, t)
         for (name, w), s, t in zip(spaces.items(), slots, tools, strict=True)
       }
-      self._rest = Rest(self, bare)
       self.aims = self._join()
+      self._rest = Rest(self, bare)
       self._teller = states.Teller(self)
       self._alias()
       self._sensed: Any = kernels.Sensed()

@@ -287,6 +287,9 @@ def test_a_current_frees_bonds_in_each_world(device, spare):
   stretch = np.where(whole[..., None], bonds.stretch.numpy()[:2], 0)
   np.testing.assert_allclose(stretch[0], alone.bonds.stretch * whole[0, :, None], atol=1e-7)
   assert not damage[2:].any() and not any(batch.organ("organ").cuts)
+  batch.reset(np.array([True, False, False, False]))
+  stretched = np.abs(bonds.stretch.numpy()).any(axis=(1, 2))
+  assert stretched.tolist() == [False, True, True, True]
 
 
 def block(windows=True, x=0.012, z=0.027, size=0.01, **keys):
