@@ -4,8 +4,8 @@ The action has the grasper's components, then those of the hook: `hook_pitch`, `
 `hook_roll`, `hook_insertion`, and `hook_current`, which is on above 0.
 
 Own observations: those of `dissect`, and `hook_front` (3,), from the hook's tip to the nearest bond
-that holds [m]; `retracted` (1,), how far the site is from its place at rest, away from the bed, as a
-share of what is needed [-]; `burnt` (1,), share of the burn that is damage [-].
+that holds [m]; `retracted` (1,), how far the site is from its place at rest, away from the bed, as
+a share of what is needed [-]; `burnt` (1,), share of the burn that is damage [-].
 
 A current frees the bonds whose strands the hook's wire touches in 0.2 s: a strand goes from the bed
 to the organ and is as thick as its skin, and a spark leaps 0.3 mm to it. What comes free while the
