@@ -47,6 +47,8 @@ def exercise(steps=300, instruments=("left", "right"), seed=0, journal=None):
       grip=np.full(len(instruments), k % 100 < 60),
       held=np.full(len(instruments), 10 < k % 100 < 40),
       visible=rng.rand(len(instruments)) > 0.1,
+      centred=rng.rand(len(instruments)) > 0.3,
+      horizon=rng.rand(len(instruments)),
       arrays={"qpos": rng.rand(9), "action": rng.rand(5).astype(np.float32), "step": k},
     )
   recorder.event("target", 1.0, 0.002, label="first")

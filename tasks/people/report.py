@@ -92,9 +92,9 @@ def ending(recording: Recording) -> str:
   if outcome is None:
     return "How it ended was not recorded"
   words = _ENDS.get(outcome, f"Failed: {outcome}")
-  notes = [event for event in recording.events if event.kind == "note" and event.label]
-  if outcome == "damage" and notes:  # the exercise's, of what harmed it
-    words = f"Failed: {notes[-1].label}"
+  notes = [event.label for event in recording.events if event.kind == "note" and event.label]
+  if outcome == "damage" and notes and notes[-1] != SUCCESS:  # the exercise's, of what harmed it
+    words = f"Failed: {notes[-1]}"
   if len(recording.time):
     words += f", after {number(float(recording.time[-1] - recording.time[0]))} s"
   return f"{words}: {recording.info['error']}" if "error" in recording.info else words

@@ -92,7 +92,7 @@ def test_a_trainee_through_the_commands(folder, capsys, tmp_path):
   fill(folder, "Ada", 12, outcome="time limit")
   for k in range(12, 30):
     said = say(capsys, *words, str(k), "--performer", "expert")
-  assert "Attempt 30 at touch/easy" in said and "next is probe/easy" in said
+  assert "Attempt 30 at touch/easy" in said and "next is navigate/easy" in said
   assert not (tmp_path / "out" / "touch_easy").exists()  # in the record alone
   done = episodes(folder, "Ada")
   assert [e.seed for e in done] == list(range(30)) and len({e.session for e in done}) == 1 + 18
@@ -108,7 +108,7 @@ def test_a_trainee_through_the_commands(folder, capsys, tmp_path):
   assert "Ada" in page and "data:image/png;base64" in page and "Biau et al." in page
   say(capsys, "trainee", "show", "Ada", "-o", "ada.png", "--task", "touch/easy")
   assert (tmp_path / "ada.png").read_bytes()[:4] == b"\x89PNG"
-  assert "next probe/easy" in say(capsys, "trainee", "list")
+  assert "next navigate/easy" in say(capsys, "trainee", "list")
   said = say(capsys, "trainee", "limits", "--trainee", "Ada", "--rule", "sd:0", "-o", "own.json")
   assert "touch/easy: limits of 18 successes" in said
   own = ["--references", "own.json"]

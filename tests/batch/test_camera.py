@@ -140,7 +140,7 @@ def test_cuts_open_and_heal():
   lips = (cut["segmentation"] != whole["segmentation"][1]).any(axis=-1)
   assert 20 < lips.sum() < 200
   before, after = (each[lips].mean() for each in (whole["pixels"][1], cut["pixels"]))
-  assert after < 0.6 * before  # lips are dark
+  assert after < 0.7 * before  # lips are dark; between them the bed shows
   batch.reset()
   again = camera.draw()
   for name in OUTPUTS:

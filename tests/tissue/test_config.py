@@ -31,6 +31,7 @@ REFUSED = [
   ("foundation", "-1", "a number >= 0"),
   ("bulk", "nan", "a number >= 0"),
   ("tension", "-1", "a number >= 0"),
+  ("twist", "-1", "a number >= 0"),
   ("pressure", "inf", "a finite number"),
   ("damping", "-0.002", "a number >= 0"),
   ("integrator", "euler", "'implicit'"),

@@ -155,6 +155,7 @@ def _slots(
   own = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + count].copy()
   jointed = mjstruct.view(m.body_jntnum, m.nbody, np.int32)[own] > 0
   try:
+    declare.check_surface(m, flex, window)
     declare.check_flex(m, flex, window)
     if not jointed.all():
       raise ValueError(f"organ {window!r}: vertices without joints, expected no pins")

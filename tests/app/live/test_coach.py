@@ -95,7 +95,7 @@ def test_a_card_says_what_was_good_what_to_do_next_and_what_helps():
   assert unjudged["better"] == unjudged["good"] == [] and unjudged["composite"] is None
   stopped = dataclasses.replace(made, info={**made.info, "outcome": "damage"})
   failed = card(stopped, strict)
-  assert "Failed: a force above" in failed["ending"]
+  assert "Failed: tissue was harmed" in failed["ending"]
   assert not failed["done"] and failed["composite"] is None  # -20 says nothing to a person
   rows = {row["label"]: row["value"] for row in failed["rows"]}
   assert "Path length" not in rows and "Peak force" in rows  # what ends early is short
