@@ -333,9 +333,14 @@ def out_of_view(time: ArrayLike, visible: ArrayLike) -> float:
     time: sample times [s]  (nstep,)
     visible: 1 where the camera's view holds the tip, else 0 (see `samples.in_view`)  (nstep,)
   """
+  return _share_without("visible", visible, time)
+
+
+def _share_without(name: str, holds: ArrayLike, time: ArrayLike) -> float:
+  """Returns the share of time that something is not so [%]; `holds` is 1 where it is."""
   time = check_time(time)
-  seen = same("visible", rows("visible", visible), time) > 0.5
-  return 100 * weights(time)[~seen].sum() / (time[-1] - time[0])
+  so = same(name, rows(name, holds), time) > 0.5
+  return 100 * weights(time)[~so].sum() / (time[-1] - time[0])
 
 
 @metric("Off centre", "%", "efficiency", "all", "PMC6465181: centre the target")
@@ -346,9 +351,7 @@ def off_centre(time: ArrayLike, centred: ArrayLike) -> float:
     time: sample times [s]  (nstep,)
     centred: 1 where what is to be shown is in the middle of the camera's view, else 0  (nstep,)
   """
-  time = check_time(time)
-  shown = same("centred", rows("centred", centred), time) > 0.5
-  return 100 * weights(time)[~shown].sum() / (time[-1] - time[0])
+  return _share_without("centred", centred, time)
 
 
 @metric("Horizon angle", "rad", "dexterity", "all", "this project: a level picture")
