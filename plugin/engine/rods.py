@@ -41,10 +41,9 @@ _HUGE = 1e6  # more than any twist [rad]
 
 @struct
 class Rod:
-  """A rod in MuJoCo's arrays and in the solver's; node i begins edge i."""
+  """A rod in its solver's arrays, of one world; node i begins edge i."""
 
   nnode: int  # nodes
-  flex: int  # its flex
   newton: int  # most iterations of a step
   twists: int  # whether it resists twisting
   most_rows: int  # MuJoCo's rows that there is room for
@@ -63,17 +62,10 @@ class Rod:
   mass: doubles("nnode")  # of a node [kg]
   spin: doubles("nnode")  # inertia of an edge about itself [kg m^2]
   held: ints("nunknown")  # whether an unknown does not change
-  rest: doubles("nnode", 3)  # rest position in the slides' axes [m]
-  dofadr: ints("nnode")  # first dof of a node, -1 for pinned ones
-  qposadr: ints("nnode")  # its first number in qpos
-  bodyid: ints("nnode")  # its body
-  massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
-  solution: doubles("nv")  # scratch
-  own_dof: ints("nv")  # number of a dof in the rod: three times the node, and the axis; or -1
-  frame: doubles(3, 3)  # rotation from the slides' axes to the world
   # A step:
   start: doubles("nnode", 3)  # place as it begins, in the slides' axes [m]
   vel: doubles("nnode", 3)  # velocity then [m/s]
+  last: doubles("nnode", 3)  # acceleration of the last step [m/s^2]
   external: doubles("nnode", 3)  # force besides elasticity and constraints [N]
   aim: doubles("nnode", 3)  # place where it would end without these [m]
   place: doubles("nnode", 3)  # place as it ends [m]
@@ -98,6 +90,22 @@ class Rod:
   row_node: ints("nrow")  # the first of the two nodes
   row_value: doubles("nrow", 9)  # J of their dofs; J a of other bodies less aref; D; friction
   own: RodState
+
+
+@struct
+class Bound:
+  """A rod and MuJoCo's arrays."""
+
+  rod: Rod
+  flex: int  # its flex
+  rest: doubles("nnode", 3)  # rest position in the slides' axes [m]
+  dofadr: ints("nnode")  # first dof of a node, -1 for pinned ones
+  qposadr: ints("nnode")  # its first number in qpos
+  bodyid: ints("nnode")  # its body
+  massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
+  solution: doubles("nv")  # scratch
+  own_dof: ints("nv")  # number of a dof in the rod: three times the node, and the axis; or -1
+  frame: doubles(3, 3)  # rotation from the slides' axes to the world
   mj: Mujoco
   # MuJoCo's memory under its own names; the mjData itself:
   nv: int
@@ -113,7 +121,7 @@ class Rod:
 
 _CONSTANTS = contacts.CONSTANTS | {"CORE": CORE, "NEIGHBOURS": NEIGHBOURS}
 begin, end = (
-  kernel(name, "coupling/rod.h", Rod, _CONSTANTS) for name in ("begin_rod", "end_rod")
+  kernel(name, "coupling/mujoco_rod.h", Bound, _CONSTANTS) for name in ("begin_rod", "end_rod")
 )
 
 
@@ -198,6 +206,47 @@ def read(model: int, instance: int) -> Declaration:
   return Declaration(name, flex, config, radius, rest, free, body, dofadr, qposadr, frame, origin)
 
 
+def settings(organ: Declaration, friction: float) -> dict:
+  """Returns the fields of `Rod` that say what a thread is beside `rod.constants`."""
+  n = len(organ.rest)
+  held = np.repeat(~organ.free, 4).reshape(n, 4)
+  held[:, 3] = np.append(organ.clamped, True)
+  return dict(
+    newton=organ.config.iterations,
+    most_rows=_MOST_ROWS * n,
+    most_pairs=_MOST_PAIRS * n,
+    collides=1,
+    radius=organ.radius,
+    hardness=_SOFT * float(np.mean(organ.config.young)) * organ.radius,
+    friction=friction,
+    slow=_SLOW,
+    held=held.ravel(),
+  )
+
+
+def scratch(n: int) -> dict[str, np.ndarray]:
+  """Returns the fields of `Rod` that a step of n nodes writes."""
+  nodes = ("start", "vel", "last", "external", "aim", "place", "listed")
+  unknowns = ("force", "move", "trial", "gradient", "first", "start_of_row", "below")
+  pairs, rows, entries = _MOST_PAIRS * n, _MOST_ROWS * n, 2 * n * (4 * n + 1)
+  return dict(
+    **{name: np.zeros((n, 3)) for name in nodes},
+    **{name: np.zeros(4 * n) for name in unknowns},
+    turn=np.zeros(n),
+    matrix=np.zeros(entries),
+    inverse=np.zeros(entries),
+    status=np.zeros(1),
+    count=np.zeros(3),
+    reach=np.zeros(1),
+    pair=np.zeros((pairs, 2)),
+    pressure=np.zeros(pairs),
+    touch=np.zeros((pairs, 5)),
+    row_kind=np.zeros(rows),
+    row_node=np.zeros(rows),
+    row_value=np.zeros((rows, 9)),
+  )
+
+
 def _check(m, flex: int, name: str):
   """Raises ValueError where a flex cannot be a thread."""
   dim = mjstruct.view(m.flex_dim, m.nflex, np.int32)[flex]
@@ -242,27 +291,19 @@ class Workspace:
     sizes = {"nvert": n}
     size = layout.size(RodState, sizes)
     self.state = coupling.plugin_state(model, self.data, self.instance, size)
-    found = coupling.mujoco_arrays(model, self.data, Rod)
+    found = coupling.mujoco_arrays(model, self.data, Bound)
     own_dof = np.full(m.nv, -1)
     own_dof[organ.dofs] = (3 * np.flatnonzero(organ.free)[:, None] + np.arange(3)).ravel()
-    held = np.repeat(~organ.free, 4).reshape(n, 4)
-    held[:, 3] = np.append(organ.clamped, True)
     mass = mjstruct.view(m.body_mass, m.nbody)[organ.body]
     mass = np.where(organ.free, mass, mass[organ.free].mean())
+    friction = float(mjstruct.view(m.flex_friction, (m.nflex, 3))[organ.flex, 0])
     self.constants = rod.constants(organ.rest, organ.radius, organ.config, mass, organ.clamped)
     self.own = layout.carve(RodState, self.state, sizes)
-    values = self.constants | dict(
+    values = self.constants | settings(organ, friction) | scratch(n)
+    own = fill(Rod, "cpu", values | {"mass": mass, "own": self.own})
+    values = dict(
+      rod=own,
       flex=organ.flex,
-      newton=organ.config.iterations,
-      most_rows=_MOST_ROWS * n,
-      most_pairs=_MOST_PAIRS * n,
-      collides=1,
-      radius=organ.radius,
-      hardness=_SOFT * float(np.mean(organ.config.young)) * organ.radius,
-      friction=float(mjstruct.view(m.flex_friction, (m.nflex, 3))[organ.flex, 0]),
-      slow=_SLOW,
-      mass=mass,
-      held=held.ravel(),
       rest=organ.rest,
       dofadr=organ.dofadr,
       qposadr=organ.qposadr,
@@ -271,23 +312,6 @@ class Workspace:
       solution=np.zeros(m.nv),
       own_dof=own_dof,
       frame=organ.frame,
-      **{name: np.zeros((n, 3)) for name in ("start", "vel", "external", "aim", "place")},
-      **{name: np.zeros(4 * n) for name in ("force", "move", "trial", "gradient")},
-      matrix=np.zeros(2 * n * (4 * n + 1)),
-      inverse=np.zeros(2 * n * (4 * n + 1)),
-      **{name: np.zeros(4 * n) for name in ("first", "start_of_row", "below")},
-      reach=np.zeros(1),
-      listed=np.zeros((n, 3)),
-      pair=np.zeros((_MOST_PAIRS * n, 2)),
-      pressure=np.zeros(_MOST_PAIRS * n),
-      touch=np.zeros((_MOST_PAIRS * n, 5)),
-      turn=np.zeros(n),
-      status=np.zeros(1),
-      count=np.zeros(3),
-      row_kind=np.zeros(_MOST_ROWS * n),
-      row_node=np.zeros(_MOST_ROWS * n),
-      row_value=np.zeros((_MOST_ROWS * n, 9)),
-      own=self.own,
       mj=coupling.mujoco_arrays(model, self.data),
       nv=m.nv,
       memory=coupling.wrap(self.data, mjstruct.size(mjstruct.Data) // 8, wp.uint64),
@@ -295,11 +319,11 @@ class Workspace:
     )
     with graphs.lock:
       cpu = wp.get_device("cpu")
-      self.fields = fill(Rod, cpu, values)
+      self.fields = fill(Bound, cpu, values)
       for each in (begin, end):
         each.load(cpu)
       self._begin, self._end = begin.command(self.fields), end.command(self.fields)
-    self._status = self.fields.status.numpy().data
+    self._status = own.status.numpy().data
     self.seen.signature = self.own.signature.numpy().data
     self.seen.identity = mjstruct.Identity(model)
     self.seen.warning = mjstruct.warnings(self.data)

@@ -170,10 +170,7 @@ PALPATE void hold(const Fields& f, double* g, const Envelope& H) {
 template <class Fields>
 PALPATE void predict(const Fields& f, double h) {
   for (int i = 0; i < f.nnode; ++i) {
-    const int adr = f.dofadr.data[i];
-    D3 ahead = h * load(f.vel.data + 3 * i);
-    if (adr >= 0) ahead += h * h * load(f.qacc_warmstart.data + adr);
-    store(f.trial.data + 3 * i, ahead);
+    store(f.trial.data + 3 * i, h * load(f.vel.data + 3 * i) + h * h * load(f.last.data + 3 * i));
   }
   const double part = safe_part(f, f.start.data, f.trial.data, 3);
   for (int a = 0; a < 3 * f.nnode; ++a) f.place.data[a] = f.start.data[a] + part * f.trial.data[a];

@@ -1,0 +1,108 @@
+// A rod among MuJoCo's own dofs, in MuJoCo's memory.
+#pragma once
+#include "coupling/contact_rows.h"
+#include "coupling/rod.h"
+
+AS_WRITTEN
+
+namespace palpate {
+
+template <class Fields>
+struct MujocoRod {
+  const Fields& f;
+  const decltype(Fields::rod)& rod;
+
+  PALPATE int own_dof(int dof) const { return f.own_dof.data[dof]; }
+  PALPATE double* solution() const { return f.solution.data; }
+  PALPATE const double* qLD() const { return f.mj.qLD.data; }
+  PALPATE const double* qLDiagInv() const { return f.mj.qLDiagInv.data; }
+
+  PALPATE Row row(int r) const { return row_of(f, r); }
+  PALPATE double reference(int r) const {
+    const double* kbip = datum<double*>(f, DATA_EFC_KBIP) + 4 * r;
+    const double gap = datum<double*>(f, DATA_EFC_POS)[r] - datum<double*>(f, DATA_EFC_MARGIN)[r];
+    return -(kbip[1] * velocity(f, r) + kbip[0] * kbip[2] * gap);
+  }
+  PALPATE double stiffness(int r) const { return datum<double*>(f, DATA_EFC_D)[r]; }
+  PALPATE double last_acceleration(int dof) const { return f.qacc_warmstart.data[dof]; }
+
+  PALPATE bool moves(int i) const { return f.dofadr.data[i] >= 0; }
+  PALPATE D3 inertia(int i) const {
+    const int* at = f.massadr.data + 3 * i;
+    return {f.mj.M.data[at[0]], f.mj.M.data[at[1]], f.mj.M.data[at[2]]};
+  }
+  PALPATE void set_inertia(int i, D3 Mhat) const {
+    palpate::set_inertia(f.mj, f.massadr.data + 3 * i, f.dofadr.data[i], Mhat);
+  }
+  PALPATE void push(int i, D3 force) const {
+    double* out = f.mj.qfrc_passive.data + f.dofadr.data[i];
+    store(out, load(out) + force);
+  }
+  PALPATE D3 found(int i) const { return load(f.mj.qfrc_constraint.data + f.dofadr.data[i]); }
+  PALPATE void move(int i, D3 moved, double h) const {
+    const int q = f.qposadr.data[i];
+    const D3 at = load(rod.start.data + 3 * i) - load(f.rest.data + 3 * i) + load(f.mj.qpos0.data + q);
+    store(f.mj.qpos.data + q, at + moved);
+    store(f.mj.qvel.data + f.dofadr.data[i], (1.0 / h) * moved);
+  }
+
+  PALPATE bool is_own(const char* contact) const {
+    return side_of(contact, CONTACT_FLEX, 0) == f.flex || side_of(contact, CONTACT_FLEX, 1) == f.flex;
+  }
+
+  // Notes the rows of constraints that act on the rod. Contacts are there before they touch, by the flex's
+  // margin, which is taken off again: one that came a step late would find light nodes far inside.
+  PALPATE void note_rows() const {
+    const int nefc = datum<int>(f, DATA_NEFC), ncon = nefc > 0 ? datum<int>(f, DATA_NCON) : 0;
+    char* const contacts = datum<char*>(f, DATA_CONTACT);
+    for (int c = 0; c < ncon; ++c) {
+      const char* contact = contacts + (size_t)CONTACT_LENGTH * c;
+      const Rows rows = is_own(contact) ? rows_of(f, contact) : Rows{0, 0, false};
+      if (!rows.count) continue;
+      keep_closed(f, contact, rows, f.flex_margin.data[f.flex]);
+      note_contact(*this, rows.first, rows.count, !rows.paired && rows.count > 1,
+                   *(const double*)(contact + CONTACT_MU), (const double*)(contact + CONTACT_FRICTION));
+    }
+    note_joints(*this, nefc, datum<int*>(f, DATA_EFC_TYPE), datum<int*>(f, DATA_EFC_ID));
+  }
+
+  // Reads MuJoCo's arrays: where the step begins, and where it leads with no stiffness.
+  PALPATE void gather(double h) const {
+    const auto& mj = f.mj;
+    const double* R = f.frame.data;
+    const bool falls = !(mj.disableflags.data[0] & DISABLE_GRAVITY);
+    const D3 zero = {0.0, 0.0, 0.0}, gravity = falls ? add_turned(zero, R, load(mj.gravity.data)) : zero;
+    for (int i = 0; i < rod.nnode; ++i) {
+      const int adr = f.dofadr.data[i], q = f.qposadr.data[i], body = f.bodyid.data[i];
+      rod.turn.data[i] = 0.0;
+      D3 x = load(f.rest.data + 3 * i), v = zero, force = zero, last = zero;
+      if (adr >= 0) {
+        const double m = rod.mass.data[i] = mj.body_mass.data[body];
+        x += load(mj.qpos.data + q) - load(mj.qpos0.data + q);
+        v = load(mj.qvel.data + adr);
+        last = load(f.qacc_warmstart.data + adr);
+        const D3 along = m * gravity + load(mj.qfrc_applied.data + adr) + load(mj.qfrc_passive.data + adr);
+        force = external(along, R, mj.xfrc_applied.data + 6 * body);
+        store(rod.aim.data + 3 * i, x + h * v + (h * h / m) * force);
+      } else {
+        store(rod.aim.data + 3 * i, x);
+      }
+      store(rod.start.data + 3 * i, x);
+      store(rod.vel.data + 3 * i, v);
+      store(rod.last.data + 3 * i, last);
+      store(rod.external.data + 3 * i, force);
+    }
+  }
+};
+
+template <class Fields>
+PALPATE void begin_rod(const Fields& f, Thread, int) {
+  begin(MujocoRod<Fields>{f, f.rod}, f.mj.timestep.data[0]);
+}
+
+template <class Fields>
+PALPATE void end_rod(const Fields& f, Thread, int) {
+  end(MujocoRod<Fields>{f, f.rod}, f.mj.timestep.data[0]);
+}
+
+}  // namespace palpate
