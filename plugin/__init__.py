@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
   from .authoring import add_organ
+  from .needle import add_needle
   from .organ import Organ
   from .skins import add_skin
   from .spares import add_spare
@@ -23,6 +24,7 @@ __all__ = [
   "Organ",
   "Thread",
   "__version__",
+  "add_needle",
   "add_organ",
   "add_skin",
   "add_spare",
@@ -35,7 +37,9 @@ __version__ = "0.2.0"
 _BROUGHT = {
   "Organ": "organ", "add_skin": "skins", "add_spare": "spares", "add_windows": "windows",
 }  # fmt: skip
-_LATER = {"add_organ": "authoring", "add_thread": "thread", "Thread": "thread"}
+_LATER = {
+  "add_needle": "needle", "add_organ": "authoring", "add_thread": "thread", "Thread": "thread",
+}  # fmt: skip
 
 
 def register() -> int:

@@ -38,9 +38,9 @@ def floor(module: str) -> int:
   """Returns the floor of a module of the package."""
   words = module.split(".")
   room = words[1] if len(words) > 1 else "organ"  # palpate itself: the handle and register
-  handles = "attributes", "authoring", "bonds", "camera", "meshes", "screen", "skins", "spares"
+  handles = "attributes", "authoring", "bonds", "camera", "meshes", "needle", "screen", "skins"
   names = {"__main__": "app", "forces": "engine"}  # one floor, no circle
-  names |= dict.fromkeys((*handles, "thread", "windows"), "organ")
+  names |= dict.fromkeys((*handles, "spares", "thread", "windows"), "organ")
   return FLOORS.index(names.get(room, room))
 
 

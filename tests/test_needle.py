@@ -1,0 +1,78 @@
+"""`palpate.add_needle`: a rigid needle along an arc, in plain MJCF."""
+
+import mujoco
+import numpy as np
+import palpate
+import pytest
+
+LENGTH, DIAMETER = 0.026, 7e-4
+
+
+def load(spec):
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  mujoco.mj_forward(model, data)
+  return model, data
+
+
+def suture(swage, edge=2e-3):
+  """Returns the nodes of a straight thread from a place on, down the y axis [m]."""
+  return np.asarray(swage) - np.arange(20)[:, None] * (0, edge, 0)
+
+
+@pytest.mark.parametrize(("arc", "share"), [("3/8", 0.375), ("1/2", 0.5)])
+def test_its_arc_is_a_part_of_a_circle(arc, share):
+  """Ends, tangents, mass and size are those of an arc of steel wire."""
+  spec = mujoco.MjSpec()
+  palpate.add_needle(spec, "needle", arc=arc, length=LENGTH, diameter=DIAMETER, tip="cutting")
+  model, data = load(spec)
+  tip, swage = data.site("needle_tip"), data.site("needle_swage")
+  circle = LENGTH / (2 * np.pi * share)
+  chord = 2 * circle * np.sin(np.pi * share)
+  assert np.linalg.norm(tip.xpos - swage.xpos) == pytest.approx(chord)
+  along = tip.xmat.reshape(3, 3)[:, 2]
+  assert along @ tip.xpos == pytest.approx(0, abs=1e-12)
+  assert along[1] * np.cross(swage.xpos, tip.xpos)[2] >= -1e-12
+  wire = 7900 * np.pi * DIAMETER**2 / 4 * LENGTH
+  assert model.body("needle").mass[0] == pytest.approx(wire, rel=0.1)  # the point is thinner
+  assert model.site("needle_tip").size[0] == pytest.approx(DIAMETER / 2)
+
+
+def test_its_thread_hangs_on_the_swage():
+  """The first node stays at the swage of a needle that falls and is thrown about."""
+  spec = mujoco.MjSpec()
+  swage = (0, -LENGTH / np.pi, 0.01)
+  palpate.add_thread(spec, suture(swage), "suture")
+  palpate.add_needle(spec, "needle", length=LENGTH, pos=(0, 0, 0.01), thread="suture")
+  model, data = load(spec)
+  data.joint("needle").qvel[:] = 0.1, 0, 0, 0, 0, 10
+  off = []
+  for _ in range(200):
+    mujoco.mj_step(model, data)
+    off.append(np.linalg.norm(data.site("needle_swage").xpos - data.body("suture_0").xpos))
+  assert max(off) < 1e-3  # the thread was at rest
+  assert max(off[100:]) < 2e-4
+  assert not data.warning.number.any()
+
+
+@pytest.mark.parametrize(
+  ("given", "message"),
+  [
+    ({"arc": "1/3"}, "arc is '1/3', expected one of 1/4, 3/8, 1/2, 5/8"),
+    ({"tip": "blunt"}, "tip is 'blunt', expected one of taper, cutting"),
+    ({"length": -1.0}, "length is -1, expected above 0"),
+    ({"diameter": 0.01}, "diameter is 0.01, expected above 0, below 0.0065"),
+    ({"name": "suture"}, "expected a name that no body of the spec has"),
+    ({"thread": "suture"}, "first node of thread 'suture' is at .* expected at the swage"),
+    ({"thread": "silk"}, "thread is 'silk', expected one of the spec's"),
+    ({"thread": "long", "pos": (0, LENGTH / np.pi, 0.1)}, "edges of thread 'long' are 30 mm long"),
+    ({"parent": "hand"}, "no body 'hand'"),
+  ],
+)
+def test_errors_say_what_is_allowed(given, message):
+  spec = mujoco.MjSpec()
+  palpate.add_thread(spec, suture((0, 0, 0)), "suture")
+  palpate.add_thread(spec, suture((0, 0, 0.1), 0.03), "long")
+  with pytest.raises(ValueError, match=message):
+    palpate.add_needle(spec, **({"length": LENGTH} | given))
+  assert spec.body("needle") is None
