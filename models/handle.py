@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from . import trocar as ports
+from . import wrist
 
 Vector = Sequence[float] | np.ndarray
 Quat = tuple[float, float, float, float]
@@ -115,10 +116,65 @@ class Handle:
     return np.array([pitch, yaw, roll, insertion])
 
 
-def find(model: mujoco.MjModel, data: mujoco.MjData, prefix: str = "") -> Handle | None:
-  """Returns the handle of an instrument, None where position drives move it."""
+class Tip:
+  """The pose that position drives take an instrument's tip to, moved as a `Handle` is.
+
+  Inverse kinematics gives the drives their targets, so the shaft goes through the trocar whatever
+  the pose; out of reach it is the nearest one. A telemanipulator's hand feels nothing.
+
+  Attributes:
+    port: the instrument's trocar
+    pos: where the tip is to be in the world [m]  (3,)
+    quat: how it is to be turned, w x y z  (4,)
+  """
+
+  def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, prefix: str = ""):
+    """Finds the drives of the instrument whose names start with `prefix`."""
+    self.prefix, self.port = prefix, ports.trocar(model, prefix)
+    names = wrist.joints(self.port)
+    self._drives = np.array([model.actuator(prefix + name).id for name in names])
+    self._ctrl = data.ctrl
+    self.put(data.ctrl[self._drives])
+
+  def put(self, joints: wrist.Joints) -> None:
+    """Takes the pose that joints give  (4,) or (6,)."""
+    self.pos, mat = wrist.forward(self.port, joints)
+    self.quat = np.zeros(4)
+    mujoco.mju_mat2Quat(self.quat, mat.ravel())
+    self._ctrl[self._drives] = joints
+
+  def move(
+    self,
+    pos: Vector,
+    quat: Vector | None = None,
+    vel: Vector | None = None,
+    spin: Vector | None = None,
+  ) -> None:
+    """Sets the pose; arguments as of `Handle.move`, velocities are not used."""
+    self.pos, self.quat = np.array(pos), self.quat if quat is None else np.array(quat)
+    mat = np.zeros(9)
+    mujoco.mju_quat2Mat(mat, self.quat)
+    roll = float(self._ctrl[self._drives[2]])
+    joints = wrist.inverse(self.port, self.pos, mat.reshape(3, 3), roll)
+    self._ctrl[self._drives] = joints
+
+  def wrench(self) -> tuple[float, float, float, float, float, float]:
+    """Returns zeros, see `Handle.wrench`."""
+    return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+
+  def joints(self, trocar: ports.Trocar) -> np.ndarray:
+    """Returns the targets of the drives  (4,) or (6,)."""
+    return self._ctrl[self._drives]
+
+
+def find(
+  model: mujoco.MjModel, data: mujoco.MjData, prefix: str = "", by_tip: bool = False
+) -> Handle | Tip | None:
+  """Returns the handle of an instrument; one that has drives has a `Tip`, if asked, or None."""
   known = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{prefix}handle") >= 0
-  return Handle(model, data, prefix) if known else None
+  if known:
+    return Handle(model, data, prefix)
+  return Tip(model, data, prefix) if by_tip else None
 
 
 class Shaft:

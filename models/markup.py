@@ -301,13 +301,13 @@ def keyframes(
   for key in ("home", "touch", "press"):
     qpos, ctrl, mocap = [], [], []
     for i, (instrument, port) in enumerate(zip(instruments, build.entry.ports, strict=False)):
-      jaws = instrument in ("grasper", "scissors")
+      jaws, bent = instrument in trocar.JAWED, [0] * 2 * (instrument in trocar.WRISTED)
       near = 0.0 if key == "home" else port.gap - (0.008 if jaws else 0.005)
       deep = port.gap + 0.01 if key == "press" and i == 0 else near
       opening = 0.7 if jaws and key != "home" else 0.0
-      qpos += [0, 0, near, 0] + [opening / 2] * 2 * jaws
+      qpos += [0, 0, near, 0] + bent + [opening / 2] * 2 * jaws
       ctrl += [0] * 6 if handle else [0, 0, deep, 0]
-      ctrl += [opening] * jaws
+      ctrl += [opening] * jaws + bent
       pos, quat = _place(build, port)
       shaft = np.zeros(3)
       mujoco.mju_rotVecQuat(shaft, np.array([0.0, 0.0, -1.0]), quat)

@@ -17,7 +17,7 @@ from . import catalog, markup, organs, shapes, trocar
 from .catalog import DEFAULT, GRIDS, RESOLUTIONS
 from .organs import Build
 
-INSTRUMENTS = trocar.NAMES
+INSTRUMENTS = (*trocar.NAMES, *trocar.WRISTED)
 COUPLINGS = ("nodal", "window")
 _ROOM = 300  # vertices of a window where triangles are finer under the instruments
 # Of contacts there: those of light vertices are soft, and a tool would sink in.
@@ -61,7 +61,7 @@ def load(
       it is thick; None for triangles of one size
   """
   build = _build(name, nodes, seed, grid, fine)
-  check_instruments(instruments)
+  check_instruments(instruments, handle)
   spec = mujoco.MjSpec.from_string(markup.scene(build, name, instruments, handle, root=None))
   spec.attach(_organ(build, name, coupling, interior), prefix=f"{name}/", frame=spec.frame(name))
   if fine is not None:
@@ -129,12 +129,13 @@ def _build(
   return built if fine is None else built.finer(fine)
 
 
-def check_instruments(instruments: Sequence[str]):
-  """Raises ValueError where a scene cannot have these instruments."""
+def check_instruments(instruments: Sequence[str], handle: bool = False):
+  """Raises ValueError where a scene cannot have these instruments, with handles or without."""
   if isinstance(instruments, str):
     raise ValueError(f"instruments is {instruments!r}, expected a tuple such as ({instruments!r},)")
   for instrument in instruments:
-    if instrument not in INSTRUMENTS:
-      raise ValueError(f"instrument is {instrument!r}, {choices(instrument, INSTRUMENTS)}")
+    known = trocar.NAMES if handle else INSTRUMENTS
+    if instrument not in known:
+      raise ValueError(f"instrument is {instrument!r}, {choices(instrument, known)}")
   if len(instruments) > 2:
     raise ValueError(f"instruments has {len(instruments)} names, expected at most two")

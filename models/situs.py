@@ -104,7 +104,7 @@ def abdomen(
   for name in nodes:
     if name not in NAMES:
       raise ValueError(f"soft has {name!r}, expected some of {', '.join(NAMES)}")
-  scene.check_instruments(instruments)
+  scene.check_instruments(instruments, handle)
   spec = mujoco.MjSpec.from_string(_BASE)
   for name, count in nodes.items():
     frame = spec.worldbody.add_frame(pos=place(name), quat=catalog.SUPINE_QUAT)
@@ -351,9 +351,11 @@ def obstruct(
       prefix = port.name.removesuffix("trocar")
       jaws = spec.body(f"{prefix}jaw_left") is not None
       if jaws:  # closed they are a capsule: their many geoms would cost a twelfth of a step
-        spec.body(f"{prefix}tip").add_geom(
+        end = spec.site(f"{prefix}tip")
+        low = end.pos[2]
+        end.parent.add_geom(
           type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-          fromto=[0.0, 0.0, _JAW[0], 0.0, 0.0, _JAW[1]],
+          fromto=[0.0, 0.0, low + _JAW[0], 0.0, 0.0, 0.0 if low else _JAW[1]],
           size=[_JAW[0], 0, 0],
           contype=_INSIDE | _WITHIN,
           conaffinity=0,

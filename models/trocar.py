@@ -19,7 +19,10 @@ import numpy as np
 from palpate.tissue.reading import choices
 
 NAMES = ("probe", "grasper", "scissors", "hook", "scalpel", "laparoscope")
+WRISTED = ("psm",)  # with a wrist, and without a handle, see `wrist`
+JAWED = ("grasper", "scissors", "psm")
 JOINTS = ("pitch", "yaw", "insertion", "roll")
+WRIST = ("wrist_pitch", "wrist_yaw")
 DEPTH = 0.12  # from the trocar to the tip when every joint is zero [m]
 RANGES = ((-1.0472, 1.0472), (-1.0472, 1.0472), (-0.08, 0.13), (-3.1416, 3.1416))  # as JOINTS
 _TOLERANCE = 1e-9  # rounding that `inverse` accepts at the ends of a range
@@ -34,7 +37,9 @@ class Trocar:
     pos: the trocar point in the world [m]  (3,)
     mat: the instrument's frame in the world  (3, 3)
     depth: from the trocar to the tip when every joint is zero [m]
-    ranges: limits of pitch, yaw [rad], insertion [m] and roll [rad]  (4, 2)
+    ranges: limits of pitch, yaw [rad], insertion [m], roll, and those of a wrist [rad]
+      (4, 2) or (6, 2)
+    wrist: between the axes of a wrist, and from the second to the tip; empty without one [m]
   """
 
   name: str = "instrument"
@@ -42,12 +47,14 @@ class Trocar:
   mat: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
   depth: float = DEPTH
   ranges: np.ndarray = dataclasses.field(default_factory=lambda: np.array(RANGES))
+  wrist: tuple[float, ...] = ()
 
 
 def path(name: str, handle: bool = False) -> pathlib.Path:
   """Returns the MJCF file of an instrument, `handle` for the one with the virtual coupling."""
-  if name not in NAMES:
-    raise ValueError(f"instrument is {name!r}, {choices(name, NAMES)}")
+  known = NAMES if handle else (*NAMES, *WRISTED)
+  if name not in known:
+    raise ValueError(f"instrument is {name!r}, {choices(name, known)}")
   return pathlib.Path(__file__).parent / "instruments" / f"{name}{'_handle' if handle else ''}.xml"
 
 
@@ -63,7 +70,7 @@ def attach(
 
   Args:
     spec: the scene, changed in place
-    name: one of `NAMES`
+    name: one of `NAMES` or, without a handle, of `WRISTED`
     prefix: put before every name of the instrument, for instance "left/"
     pos: the trocar point [m]
     quat: orientation of the instrument's frame (`aim` makes one)
@@ -98,13 +105,16 @@ def trocar(model: mujoco.MjModel, prefix: str = "") -> Trocar:
   try:
     body = model.body(f"{prefix}trocar").id
     tip = model.site(f"{prefix}tip")
-    ranges = np.array([model.joint(f"{prefix}{joint}").range for joint in JOINTS])
+    wristed = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, prefix + WRIST[0]) >= 0
+    joints = (*JOINTS, *WRIST) if wristed else JOINTS
+    ranges = np.array([model.joint(prefix + joint).range for joint in joints])
   except KeyError as error:
     raise ValueError(f"no instrument with the prefix {prefix!r} in the model: {error}") from None
   if model.body_weldid[body] != 0:
     raise ValueError(f"instrument {prefix!r}: its trocar moves, expected one fixed to the world")
   depth = -tip.pos[2]
   child = int(tip.bodyid[0])
+  wrist = (-float(model.body_pos[child, 2]), float(depth)) if wristed else ()
   while child != body:
     depth -= model.body_pos[child, 2]
     child = int(model.body_parentid[child])
@@ -117,7 +127,7 @@ def trocar(model: mujoco.MjModel, prefix: str = "") -> Trocar:
     body = int(model.body_parentid[body])
   mat = np.zeros(9)
   mujoco.mju_quat2Mat(mat, quat)
-  return Trocar(prefix, pos, mat.reshape(3, 3), float(depth), ranges)
+  return Trocar(prefix, pos, mat.reshape(3, 3), float(depth), ranges, wrist)
 
 
 def forward(trocar: Trocar, joints) -> np.ndarray:

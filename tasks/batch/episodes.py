@@ -11,7 +11,7 @@ import gymnasium
 import mujoco as mj
 import numpy as np
 from palpate.camera import lens
-from palpate.models import laparoscope, trocar
+from palpate.models import laparoscope, trocar, wrist
 from palpate.tasks.core import randomisation
 from palpate.tasks.core.base import Task
 from palpate.tasks.core.engine import wrap
@@ -34,7 +34,10 @@ class Posed:
 
   def tip_pos(self: Any) -> np.ndarray:
     """Returns where that puts the tip [m]  (3,)."""
-    return trocar.forward(self.trocar(), self.pose[[0, 1, 3]])
+    port = self.trocar()
+    if port.wrist:
+      return wrist.forward(port, self.pose)[0]
+    return trocar.forward(port, self.pose[[0, 1, 3]])
 
   def lens(self: Any) -> tuple[np.ndarray, np.ndarray]:
     """Returns where that puts a laparoscope's lens [m], and its picture's axes in columns."""

@@ -1,6 +1,7 @@
 """What every vectorised exercise has of its worlds: one line a field, a row a world.
 
-Sizes are named: nworld worlds, nvert nodes, nelem triangles, naction components of an action.
+Sizes are named: nworld worlds, nvert nodes, nelem triangles, naction components of an action, naxis
+axes of the instrument.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -33,12 +34,13 @@ class Common:
   head: int  # joint of a camera's head in qpos, -1 without
   optics: float  # angle between shaft and view of a laparoscope [rad]
   opening: int  # first of the two joints of the jaws in qpos
-  qposadr: ints(4)  # of pitch, yaw, roll, insertion
-  dofadr: ints(4)
-  drive: ints(4)  # actuators
-  low: floats(5)  # of the controls, the fifth last
-  high: floats(5)
-  move: floats(4)  # what an action of 1 adds to the drives' targets [rad, m]
+  qposadr: ints("naxis")  # of pitch, yaw, roll, insertion, and a wrist's pitch and yaw
+  dofadr: ints("naxis")
+  drive: ints("naxis")  # actuators
+  low: floats("ncontrol")  # of the controls, that of jaws or head last
+  high: floats("ncontrol")
+  wrist: floats(2)  # see `Trocar`; zeros without one [m]
+  move: floats("naxis")  # what an action of 1 adds to the drives' targets [rad, m]
   sensoradr: ints(4)  # of tip and shaft force, force on the left and right jaw
   around: int  # first number of the sensors of that on what is around, -1 where nothing is
   elem: ints("nelem", 3)
@@ -81,7 +83,7 @@ class Common:
   # Drawn for an episode.
   body_pos: floats("nworld", 3)  # of the trocar in the world [m]
   body_quat: floats("nworld", 4)  # w x y z
-  pose: floats("nworld", 4)  # joints at the start
+  pose: floats("nworld", "naxis")  # joints at the start
   reference: floats("nworld")  # length of the path that it asks for, 0 where it asks for none [m]
   # State.
   action: floats("nworld", "naction")
@@ -109,9 +111,9 @@ class Common:
   terminated: flags
   truncated: flags
   # Observed.
-  joints: floats("nworld", 4)
-  joint_vel: floats("nworld", 4)
-  drive_error: floats("nworld", 4)
+  joints: floats("nworld", "naxis")
+  joint_vel: floats("nworld", "naxis")
+  drive_error: floats("nworld", "naxis")
   tip_pos: floats("nworld", 3)
   tip_quat: floats("nworld", 4)
   tip_vel: floats("nworld", 3)

@@ -14,6 +14,7 @@ closeness, parts = wp.func(_closeness), wp.func(safety.parts)
 _SHARE, _PRICE = wp.constant(base.SHARE), wp.constant(base.PRICE)
 _MOST = wp.constant(base.MOST)
 _SLACK = wp.constant(base.SLACK)
+_ROOT = wp.constant(0.5**0.5)  # of a quarter turn's quaternion
 _NEAR, _FACING = wp.constant(NEAR), wp.constant(jaws.FACING)
 _distances = wp.types.vector(length=NEAR, dtype=float)
 _numbers = wp.types.vector(length=NEAR, dtype=int)
@@ -77,12 +78,13 @@ def find_bad(action: wp.array(dtype=float, ndim=2), bad: wp.array(dtype=int)):
 def act(s: Common):
   """Moves the drives' targets."""
   w = wp.tid()
-  for k in range(4):
+  count = s.drive.shape[0]
+  for k in range(count):
     target = s.ctrl[w, s.drive[k]] + wp.clamp(s.action[w, s.first + k], -1.0, 1.0) * s.move[k]
     s.ctrl[w, s.drive[k]] = wp.clamp(target, s.low[k], s.high[k])
   if s.fifth >= 0:
-    share = 0.5 * (wp.clamp(s.action[w, s.first + 4], -1.0, 1.0) + 1.0)
-    s.ctrl[w, s.fifth] = s.low[4] + (s.high[4] - s.low[4]) * share
+    share = 0.5 * (wp.clamp(s.action[w, s.first + count], -1.0, 1.0) + 1.0)
+    s.ctrl[w, s.fifth] = s.low[count] + (s.high[count] - s.low[count]) * share
 
 
 @wp.kernel(enable_backward=False)
@@ -91,7 +93,7 @@ def begin(s: Common):
   w = wp.tid()
   if not s.begun[w]:
     return
-  for k in range(4):
+  for k in range(s.drive.shape[0]):
     s.ctrl[w, s.drive[k]] = s.pose[w, k]
   if s.fifth >= 0:
     s.ctrl[w, s.fifth] = 0.0
@@ -138,7 +140,7 @@ def measure(s: Common, beginning: bool):
   w = wp.tid()
   if beginning and not s.begun[w]:
     return
-  for k in range(4):
+  for k in range(s.drive.shape[0]):
     s.joints[w, k] = s.qpos[w, s.qposadr[k]]
     s.joint_vel[w, k] = s.qvel[w, s.dofadr[k]]
     s.drive_error[w, k] = s.ctrl[w, s.drive[k]] - s.joints[w, k]
@@ -188,20 +190,38 @@ def join(s: Common, other: Common):
 
 @wp.func
 def place(s: Common, w: int):
-  """Finds the tip from the joints, see `models.trocar`."""
+  """Finds the tip from the joints, see `models.trocar` and, for a wrist, `models.wrist`."""
   pitch, yaw, roll = s.joints[w, 0], s.joints[w, 1], s.joints[w, 2]
   sp, cp, sy, cy = wp.sin(pitch), wp.cos(pitch), wp.sin(yaw), wp.cos(yaw)
-  far = s.depth + s.joints[w, 3]
+  far = s.depth - s.wrist[0] - s.wrist[1] + s.joints[w, 3]
   along = wp.vec3(sy, cy * sp, -cy * cp)
   by_pitch, by_yaw = wp.vec3(0.0, cy * cp, cy * sp), wp.vec3(cy, -sy * sp, sy * cp)
   vel = s.joint_vel[w, 3] * along
   vel += far * (s.joint_vel[w, 0] * by_pitch + s.joint_vel[w, 1] * by_yaw)
   port = wp.quat(s.body_quat[w, 1], s.body_quat[w, 2], s.body_quat[w, 3], s.body_quat[w, 0])
-  put(s.tip_pos, w, vector(s.body_pos, w) + wp.quat_rotate(port, far * along))
-  put(s.tip_vel, w, wp.quat_rotate(port, vel))
+  tip = vector(s.body_pos, w) + wp.quat_rotate(port, far * along)
+  vel = wp.quat_rotate(port, vel)
   q = port * wp.quat(wp.sin(0.5 * pitch), 0.0, 0.0, wp.cos(0.5 * pitch))
   q = q * wp.quat(0.0, -wp.sin(0.5 * yaw), 0.0, wp.cos(0.5 * yaw))
+  turning = s.joint_vel[w, 0] * wp.quat_rotate(port, wp.vec3(1.0, 0.0, 0.0))
+  turning -= s.joint_vel[w, 1] * wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0))
   q = q * wp.quat(0.0, 0.0, -wp.sin(0.5 * roll), wp.cos(0.5 * roll))
+  if s.drive.shape[0] > 4:
+    turning -= s.joint_vel[w, 2] * wp.quat_rotate(q, wp.vec3(0.0, 0.0, 1.0))
+    turning -= s.joint_vel[w, 4] * wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0))
+    half = 0.5 * s.joints[w, 4]
+    q = q * wp.quat(0.0, -wp.sin(half), 0.0, wp.cos(half))
+    link = wp.quat_rotate(q, wp.vec3(0.0, 0.0, -s.wrist[0]))
+    tip += link
+    vel += wp.cross(turning, link)
+    turning += s.joint_vel[w, 5] * wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
+    half = 0.5 * s.joints[w, 5]
+    q = q * wp.quat(wp.sin(half), 0.0, 0.0, wp.cos(half)) * wp.quat(0.0, 0.0, -_ROOT, _ROOT)
+    link = wp.quat_rotate(q, wp.vec3(0.0, 0.0, -s.wrist[1]))
+    tip += link
+    vel += wp.cross(turning, link)
+  put(s.tip_pos, w, tip)
+  put(s.tip_vel, w, vel)
   s.tip_quat[w, 0] = q[3]
   for k in range(3):
     s.tip_quat[w, 1 + k] = q[k]

@@ -16,7 +16,7 @@ from palpate.batch.threads import Threads
 from palpate.models import trocar
 from palpate.tasks.core import episode, jaws
 from palpate.tasks.core.environment import Environment
-from palpate.tasks.core.instrument import AROUND, AXES, FIFTH, FORCES, JAWS, RATES, TOUCH
+from palpate.tasks.core.instrument import AROUND, FIFTH, FORCES, RATES, TOUCH, axes, jawed
 from palpate.tasks.core.scenes import GUIDED
 from palpate.tasks.core.stage import STATE
 from palpate.tissue.types import allocate
@@ -79,7 +79,7 @@ class Worlds:
     self.fields, self.other, self.guided = self._make(task, task.prefix, dt, limit), None, None
     if task.second:
       self.other = self._make(task, task.second, dt, limit)
-      self.other.first = len(task.components) - len(AXES) - len(task.other)
+      self.other.first = len(task.components) - len(axes(task.second)) - len(task.other)
       for name in ("action", "begun", "step"):
         setattr(self.other, name, getattr(self.fields, name))
       for name in ("tip_pos", "tip_quat", "tissue_force"):
@@ -121,25 +121,26 @@ class Worlds:
 
   def _make(self, task: Any, prefix: str, dt: float, limit: int) -> Any:
     physics, model = self.episodes.physics, self.batch.model
+    names, port = axes(prefix), trocar.trocar(model, prefix)
     sizes = dict(
       nworld=self.nworld, nvert=self.organ.nvert, nelem=len(self.organ.elem), nq=model.nq,
       nv=model.nv, nu=model.nu, nsensordata=model.nsensordata, nstep=self._substeps,
-      naction=len(task.components), nside=model.ngeom + 1,
-      nspot=len(getattr(task, "disc", ())), nbond=len(physics.organ.bonds),
+      naction=len(task.components), naxis=len(names), ncontrol=len(names) + 1,
+      nside=model.ngeom + 1, nspot=len(getattr(task, "disc", ())), nbond=len(physics.organ.bonds),
       ncutter=len(physics.organ.cutters),
     )  # fmt: skip
     s = allocate(Common, self.device, sizes)
     s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
     s.force_limit, s.damage = task.force_limit, task.damage
-    s.depth, s.optics = trocar.trocar(model, prefix).depth, physics.optics
+    s.depth, s.optics = port.depth, physics.optics
     self._point_at(s, prefix, model)
-    drives = [model.actuator(prefix + axis).id for axis in AXES]
+    drives = [model.actuator(prefix + axis).id for axis in names]
     controls = model.actuator_ctrlrange[[*drives, s.fifth if s.fifth >= 0 else drives[0]]]
     coarse = physics.coarse
     constants = {
       "drive": drives, "low": controls[:, 0], "high": controls[:, 1],
-      "move": np.array(RATES) * dt, "elem": self.organ.elem, "coarse": coarse,
-      "coarse0": physics.organ.xpos0[coarse],
+      "move": np.array(RATES[: len(names)]) * dt, "wrist": port.wrist or (0.0, 0.0),
+      "elem": self.organ.elem, "coarse": coarse, "coarse0": physics.organ.xpos0[coarse],
     }  # fmt: skip
     bonds = physics.organ.bonds
     if len(bonds):
@@ -166,8 +167,8 @@ class Worlds:
   @staticmethod
   def _point_at(s: Any, prefix: str, model: mj.MjModel) -> None:
     """Writes where an instrument's joints and sensors are."""
-    jaws = prefix == JAWS
-    joints = [model.joint(prefix + axis) for axis in AXES]
+    jaws = jawed(prefix)
+    joints = [model.joint(prefix + axis) for axis in axes(prefix)]
     s.qposadr.assign(np.array([int(joint.qposadr[0]) for joint in joints]))
     s.dofadr.assign(np.array([int(joint.dofadr[0]) for joint in joints]))
     s.jaw = model.actuator(f"{prefix}jaw").id if jaws else -1
@@ -345,7 +346,7 @@ class Worlds:
       )  # fmt: skip
       if self.task.jitter:
         self.batch.place(f"{of}trocar", pos, quat, s.begun)
-      self.batch.pose([of + axis for axis in AXES], pose, s.begun)
+      self.batch.pose([of + axis for axis in axes(of)], pose, s.begun)
     if self._tissue:
       self.organ.configure(mask, **{key: rows[key] for key in self._tissue})
     self.run(self._open)

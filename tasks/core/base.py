@@ -15,8 +15,11 @@ position drives by the action times the rate:
 | 4 `report` (palpation) | above 0.5: the inclusion is here | |
 | 4 `head` (laparoscope) | turn of the camera against the scope, not a rate: 1 is half a turn | |
 
-With `input="handle"` the action says where the hand holds the instrument, in place of the first
-four, see `handle`; a spring and a damper pull the tip there, and the hand feels them.
+An instrument with a wrist has `wrist_pitch` and `wrist_yaw` after the first four, 3 rad/s at 1.
+
+With `input="handle"` the action says where the hand holds the instrument, in place of these, see
+`handle`; a spring and a damper pull the tip there, and the hand feels them. With `input="tip"` it
+says so of the tip, and inverse kinematics gives the drives their targets.
 
 Observations are in groups to choose from, see `observation` and docs/environments.md.
 
@@ -55,7 +58,7 @@ from . import engine, eyes, observation, randomisation, safety, scenes, stage
 from .environment import CONTROL_TIMESTEP
 from .eyes import OPENGL
 from .handle import ROW
-from .instrument import AXES, JAWS, SCOPE
+from .instrument import SCOPE, axes, jawed
 from .physics import Physics, check_scene
 from .randomisation import Ranges
 from .rules import DAMAGED, HIDDEN, NOW, OUTCOMES, SUCCESS
@@ -140,7 +143,7 @@ class Task(engine.Task):
       model: a scene of your own, a file or an MjSpec, in place of `scene`: it has the instrument,
         the camera `laparoscope` and the sites `target0`, ... in the world
       organ: name of the organ in it
-      input: what an action moves: the instrument's position `drives`, or its `handle`
+      input: what an action moves: the instrument's position `drives`, its `handle`, or its `tip`
       nodes: of the organ, in place of the scene's
       surroundings: `abdomen`, `unseen` or `none`, in place of the scene's, see `Scene`
       renderer: what draws pictures: `opengl`, MuJoCo's, or a device, `cpu` or `cuda:0`, as it draws
@@ -172,14 +175,18 @@ class Task(engine.Task):
   @property
   def jaws(self) -> bool:
     """Whether the instrument has jaws."""
-    return self.prefix == JAWS
+    return jawed(self.prefix)
 
   @property
   def components(self) -> tuple[str, ...]:
     """Names of the action's components."""
-    moved = ROW if self.scene.handle else AXES
     other = self.second.replace("/", "_")
-    return moved + self.extra + tuple(other + name for name in (*moved, *self.other) if other)
+    names = self.moved(self.prefix) + self.extra
+    return names + tuple(other + name for name in (*self.moved(self.second), *self.other) if other)
+
+  def moved(self, prefix: str) -> tuple[str, ...]:
+    """Returns the names of those that move an instrument as a whole."""
+    return axes(prefix) if self.scene.input == "drives" else ROW
 
   @property
   def extra(self) -> tuple[str, ...]:
@@ -189,12 +196,13 @@ class Task(engine.Task):
   @property
   def other(self) -> tuple[str, ...]:
     """Those of the other hand's instrument."""
-    return ()
+    return ("jaw",) if jawed(self.second) else ()
 
   def physics(self) -> Physics:
     """Returns the physics of the scene, to make an environment of."""
     model = self.compiled(self.variants[0]).model
     physics = Physics.from_model(engine.wrap(model))
+    physics.by_tip = self.scene.input == "tip"
     physics.use(model, self.prefix, self.targets, self.organ, self.second)
     return physics
 
@@ -292,7 +300,7 @@ class Task(engine.Task):
     arrays = {"action": self.action}
     if physics.looked is not None:
       arrays["laparoscope"] = physics.looked
-    if self.scene.handle:
+    if self.scene.input != "drives":
       arrays["felt"] = physics.felt()
       if physics.second:
         arrays[f"{self.second.replace('/', '_')}felt"] = physics.second.felt()
@@ -348,7 +356,7 @@ class Task(engine.Task):
       tip = center + (self.random.uniform(*self.clearance) + back) * away + aside
       joints = trocar.inverse(port, tip)
       pose = np.array([joints[0], joints[1], self.random.uniform(-0.5, 0.5), joints[2]])
-      hand.set_joints(pose)
+      hand.set_joints(np.concatenate([pose, np.zeros(len(port.wrist))]))
 
   def action_spec(self, physics: Physics) -> specs.BoundedArray:
     """Returns the bounds of the action; the components are at the module's head."""
@@ -360,7 +368,7 @@ class Task(engine.Task):
     """Returns the action as float64; ValueError names the component, its value and the bounds."""
     values = np.asarray(getattr(action, "continuous_actions", action), np.float64)
     names = self.components
-    if values.shape[-1:] != (len(names),) or values.ndim > (2 if self.scene.handle else 1):
+    if values.shape[-1:] != (len(names),) or values.ndim > 1 + (self.scene.input != "drives"):
       raise ValueError(
         f"{self.name}: action has shape {values.shape}, expected ({len(names)},): "
         + ", ".join(names)
@@ -379,7 +387,7 @@ class Task(engine.Task):
     self.action = values = self.check_action(action)
     first = 0
     for hand, extra in zip(physics.hands, (self.extra, self.other), strict=False):
-      count = len(ROW if self.scene.handle else AXES) + len(extra)
+      count = len(self.moved(hand.prefix)) + len(extra)
       hand.act(values[..., first : first + count], self.control_timestep)
       first += count
     if self.rules and self.rules.act:

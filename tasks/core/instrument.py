@@ -7,26 +7,41 @@ from typing import Any
 
 import mujoco as mj
 import numpy as np
-from palpate.models import laparoscope, situs, trocar
-from palpate.models.handle import Handle, find, pose
+from palpate.models import laparoscope, situs, trocar, wrist
+from palpate.models.handle import Handle, Tip, find, pose
 
 from .handle import ROW, Guide
 from .jaws import Jaws
 
 AXES = ("pitch", "yaw", "roll", "insertion")
-JAWS = "grasper/"  # prefix of the instrument that has them
 SCOPE = f"{laparoscope.NAME}/"  # prefix of the one that carries the camera
 FIFTH = ("jaw", "head")  # what a fifth component of an action drives
 TOUCH = ("touch_left", "touch_right")  # sensors of the jaws
 FORCES = ("tip_force", "shaft_force")  # sensors of what an instrument exerts
 AROUND = tuple(f"{situs.SURROUNDINGS}_{part}" for part in ("tip", "shaft"))  # and of that around
-RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
+# Pitch, yaw, roll [rad/s], insertion [m/s], and the axes of a wrist [rad/s].
+RATES = (1.0, 1.0, 3.0, 0.12, 3.0, 3.0)
 HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
 
 CLOSING = 0.005  # the drive's target is that far below the opening [rad]
 # Least opening over a fold of tissue, largest target that grips one [rad].
 FOLD, GRIPPING = 0.02, 0.15
 _RATES = np.array(RATES)
+
+
+def kind(prefix: str) -> str:
+  """Returns which instrument has a prefix, such as "psm" has "left_psm/"."""
+  return prefix.rstrip("/").rpartition("_")[2]
+
+
+def axes(prefix: str) -> tuple[str, ...]:
+  """Returns the axes of an instrument with a prefix, whose drives an action moves."""
+  return (*AXES, *trocar.WRIST) if kind(prefix) in trocar.WRISTED else AXES
+
+
+def jawed(prefix: str) -> bool:
+  """Returns whether an instrument with a prefix has jaws."""
+  return kind(prefix) in trocar.JAWED
 
 
 class Instrument:
@@ -36,7 +51,8 @@ class Instrument:
     prefix: of its names in the model, for instance "probe/"
     model: what it is in, dm_control's
     data: its state
-    handle: that pulls it, None where position drives move it
+    by_tip: whether an action says where the tip is to be, and inverse kinematics moves the drives
+    handle: that pulls it, or the pose of its tip; None where an action moves the drives
     guide: takes the handle along an action
     jaw: actuator of its jaws, -1 without
     fifth: actuator of jaws or of a camera's head, -1 without
@@ -51,7 +67,8 @@ class Instrument:
   prefix = ""
   model: Any
   data: Any
-  handle: Handle | None = None
+  by_tip = False
+  handle: Handle | Tip | None = None
   optics = 0.0
 
   def equip(self, prefix: str) -> None:
@@ -64,11 +81,13 @@ class Instrument:
       if name.startswith(prefix):
         adr = int(model.sensor_adr[i])
         self._sensors[name[len(prefix) :]] = slice(adr, adr + int(model.sensor_dim[i]))
-    joints = [model.joint(prefix + axis) for axis in AXES]
+    self._trocar = trocar.trocar(model, prefix)
+    joints = [model.joint(prefix + axis) for axis in wrist.joints(self._trocar)]
     self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
     self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
-    self.handle, self.guide = find(model, self.data.ptr, prefix), Guide()
-    driven = () if self.handle else AXES
+    self.take_hold()
+    self.guide = Guide()
+    driven = () if isinstance(self.handle, Handle) else wrist.joints(self._trocar)
     self.drives = np.array([model.actuator(prefix + axis).id for axis in driven], int)
     self.drive_range = model.actuator_ctrlrange[self.drives].copy()
     fifth = [model.actuator(prefix + name).id for name in FIFTH if name in self._sensors]
@@ -79,11 +98,14 @@ class Instrument:
     self._forced = [n for n in (*FORCES, *AROUND) if n in self._sensors]
     signals = [*self._forced, *(TOUCH if self.has_jaw else ())]
     self._signals = np.concatenate([np.arange(*self._sensors[n].indices(10**6)) for n in signals])
-    self._trocar = trocar.trocar(model, prefix)
     if prefix == SCOPE:
       self._lens = model.camera(laparoscope.NAME).id
       w, x, _, _ = model.body(f"{prefix}eye").quat
       self.optics = -2 * math.atan2(x, w)
+
+  def take_hold(self) -> None:
+    """Finds what an action holds: a handle or the pose of the tip, if any."""
+    self.handle = find(self.model.ptr, self.data.ptr, self.prefix, self.by_tip)
 
   @property
   def has_jaw(self) -> bool:
@@ -103,9 +125,12 @@ class Instrument:
 
     Without jaws their tips are the tip.
     """
-    tip, data = self.tip_pos(), self.data.ptr
-    bodies = [self.model.ptr.body(name).id for name in self._jaws.names] if self._jaws else []
-    ends = [data.xpos[b] - data.xmat[b].reshape(3, 3) @ self.model.ptr.body_pos[b] for b in bodies]
+    tip, data, model = self.tip_pos(), self.data.ptr, self.model.ptr
+    bodies = [model.body(name).id for name in self._jaws.names] if self._jaws else []
+    end = model.site(f"{self.prefix}tip").pos
+    ends = [
+      data.xpos[b] - data.xmat[b].reshape(3, 3) @ (model.body_pos[b] - end) for b in bodies
+    ]
     return np.stack([tip, *(ends or [tip, tip]), self._trocar.pos])
 
   def tip_vel(self) -> np.ndarray:
@@ -117,15 +142,15 @@ class Instrument:
     return self.sensor("tip_quat")
 
   def joints(self) -> np.ndarray:
-    """Returns pitch, yaw, roll [rad] and insertion [m]  (4,)."""
+    """Returns pitch, yaw, roll [rad], insertion [m], and a wrist's [rad]  (4,) or (6,)."""
     return self.data.ptr.qpos[self._qpos]
 
   def joint_vel(self) -> np.ndarray:
-    """Returns the velocities of `joints`  (4,)."""
+    """Returns the velocities of `joints`."""
     return self.data.ptr.qvel[self._dof]
 
   def drive_targets(self) -> np.ndarray:
-    """Returns the targets of the position drives, or where the handle is, as `joints`  (4,)."""
+    """Returns the targets of the position drives, or where the handle is, as `joints`."""
     return self.handle.joints(self._trocar) if self.handle else self.data.ptr.ctrl[self.drives]
 
   def contact_force(self) -> np.ndarray:
@@ -204,18 +229,18 @@ class Instrument:
     """Takes its part of an action, for a control step of dt [s].
 
     Args:
-      values: pitch, yaw, roll, insertion, and what is opened of the jaws; or rows of `handle`, each
-        with that
+      values: of the `axes`, and what is opened of the jaws; or rows of `handle`, each with that
       dt: duration of the control step
     """
     if self.handle:
       self.guide.follow(values.reshape(-1, values.shape[-1]))
       return
     low, high = self.drive_range.T
-    ctrl = self.data.ptr.ctrl
-    ctrl[self.drives] = (ctrl[self.drives] + values[:4] * _RATES * dt).clip(low, high)
+    ctrl, count = self.data.ptr.ctrl, len(self.drives)
+    move = values[:count] * _RATES[:count] * dt
+    ctrl[self.drives] = (ctrl[self.drives] + move).clip(low, high)
     if self.fifth >= 0:
-      self.drive_fifth(values[4])
+      self.drive_fifth(values[count])
 
   def drive_fifth(self, share: float) -> None:
     """Gives jaws their target, 1 is wide open, -1 squeezes closed jaws; or a camera's head."""
@@ -225,7 +250,10 @@ class Instrument:
   def set_joints(self, joints: np.ndarray) -> None:
     """Puts the instrument and its drives at a pose, as `joints`, with closed jaws."""
     self.data.qpos[self._qpos] = joints
-    if self.handle:
+    if isinstance(self.handle, Tip):
+      self.handle.put(joints)
+      self.guide.put(np.concatenate([self.handle.pos, self.handle.quat]))
+    elif self.handle:
       row = self.handle_row(trocar.forward(self._trocar, joints[[0, 1, 3]]), joints[2])
       self.handle.move(row[:3], row[3:])
       self.guide.put(row)
@@ -245,6 +273,8 @@ class Instrument:
     mj.mju_mulQuat(quat, rotation, body.quat)
     body.pos[:], body.quat[:] = body.pos + shift, quat
     self._trocar = trocar.trocar(model, self.prefix)
+    if isinstance(self.handle, Tip):
+      self.handle.port = self._trocar
 
   @property
   def busy(self) -> bool:
@@ -290,6 +320,7 @@ class Instrument:
     if self.has_jaw:
       jaws = values[:, 3 * count :]
       self._forces["grip_force"] = jaws.max(axis=1)
+    if self.has_jaw and not self._trocar.wrist:  # whose grip is a needle's
       # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
       grip = float(jaws.sum(axis=0).max()) / len(jaws)
       self.peak_force, self.peak_tissue = max(self.peak_force, grip), max(self.peak_tissue, grip)
@@ -311,14 +342,14 @@ class Second(Instrument):
 
   def __init__(self, physics: Any, prefix: str):
     """Finds the instrument with a prefix in a physics."""
-    self.model, self.data = physics.model, physics.data
+    self.model, self.data, self.by_tip = physics.model, physics.data, physics.by_tip
     self.equip(prefix)
     self.quiet()
 
   def bind(self, physics: Any) -> None:
     """Belongs to a copy of its physics from now on."""
     self.model, self.data = physics.model, physics.data
-    self.handle = find(self.model.ptr, self.data.ptr, self.prefix)
+    self.take_hold()
 
   def __getstate__(self) -> dict[str, Any]:
     return {k: v for k, v in vars(self).items() if k not in ("model", "data", "handle")}

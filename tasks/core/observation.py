@@ -22,7 +22,7 @@ from palpate.camera import lens
 from . import randomisation
 from .engine import Camera
 from .eyes import OPENGL, see
-from .instrument import JAWS, SCOPE
+from .instrument import jawed, kind
 from .physics import COARSE, NEAR, Physics
 from .scenes import CAMERA
 
@@ -44,7 +44,7 @@ class Row:
     unit: of its numbers
     what: it is
     measure: takes task and physics, or the other hand's instrument for a sensor, returns it
-    only: prefix of the instrument that alone has it, empty for all
+    only: what instruments have that have it: `jaws` or a `laparoscope`; empty for all
   """
 
   group: str
@@ -56,7 +56,13 @@ class Row:
 
 
 ROWS = {
-  "joints": Row("sensors", (4,), "rad, m", "pitch, yaw, roll, insertion", lambda t, p: p.joints()),
+  "joints": Row(
+    "sensors",
+    (4,),
+    "rad, m",
+    "pitch, yaw, roll, insertion; (6,) with `wrist_pitch` and `wrist_yaw` of one with a wrist",
+    lambda t, p: p.joints(),
+  ),
   "joint_vel": Row("sensors", (4,), "rad/s, m/s", "their velocities", lambda t, p: p.joint_vel()),
   "drive": Row(
     "sensors",
@@ -91,7 +97,7 @@ ROWS = {
     "rad, rad, N, N",
     "opening of the jaws, its target, force on the left and right jaw",
     lambda t, p: p.gripper(),
-    only=JAWS,
+    only="jaws",
   ),
   "camera_head": Row(
     "sensors",
@@ -99,7 +105,7 @@ ROWS = {
     "rad",
     "how far the camera is turned against the laparoscope",
     lambda t, p: p.head(),
-    only=SCOPE,
+    only="laparoscope",
   ),
   "nodes_near": Row(
     "state",
@@ -221,8 +227,8 @@ def labels(physics: Physics) -> dict[tuple[int, int], int]:
 def _segmentation(camera: Camera, physics: Physics) -> np.ndarray:
   found = camera.render(segmentation=True)
   out = np.zeros(found.shape[:2], np.uint8)
-  for (kind, number), label in labels(physics).items():
-    out[(found[..., 1] == kind) & (found[..., 0] == number)] = label
+  for (what, number), label in labels(physics).items():
+    out[(found[..., 1] == what) & (found[..., 0] == number)] = label
   return out
 
 
@@ -447,11 +453,16 @@ def _numbers(task: Any, physics: Physics) -> collections.OrderedDict:
 
 def _rows(first: str, second: str) -> list[tuple[str, Row, int]]:
   """Returns names, rows and hands of instruments with these prefixes; the second's is sensors."""
-  out = [(name, row, 0) for name, row in ROWS.items() if row.only in ("", first)]
+  out = [(name, row, 0) for name, row in ROWS.items() if _has(first, row.only)]
   for name, row in ROWS.items() if second else ():
-    if row.group == "sensors" and row.only in ("", second):
+    if row.group == "sensors" and _has(second, row.only):
       out.append((f"{second.rstrip('/')}_{name}", row, 1))
   return out
+
+
+def _has(prefix: str, only: str) -> bool:
+  """Returns whether an instrument with a prefix has what a row is of."""
+  return not only or only == kind(prefix) or (only == "jaws" and jawed(prefix))
 
 
 @functools.lru_cache
@@ -485,7 +496,7 @@ def table() -> str:
   """Returns what every exercise has as a Markdown table."""
   lines = ["| name | group | shape | type | unit | what |", "|---|---|---|---|---|---|"]
   for name, row in ROWS.items():
-    what = f"{row.what}; {row.only[:-1]} only" if row.only else row.what
+    what = f"{row.what}; {row.only} only" if row.only else row.what
     cells = f"`{row.group}` | {_text(*row.shape)} | float64 | {row.unit} | {what}"
     lines.append(f"| `{name}` | {cells} |")
   for name, p in PICTURES.items():

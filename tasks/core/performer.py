@@ -28,7 +28,7 @@ from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import numpy as np
-from palpate.models import trocar
+from palpate.models import laparoscope, trocar, wrist
 
 from ..learn import policy
 from .environment import Environment
@@ -262,29 +262,38 @@ class Performer:
     """Takes the instrument as it is when an episode begins."""
     self.hand: Any = self.physics.hands[self._which]
     self.trocar = self.hand.trocar()
-    joints = self.hand.drive_targets()[[0, 1, 3]]
-    self.tip = trocar.forward(self.trocar, joints)  # where the tip is told to be
-    self.roll = float(self.hand.drive_targets()[2])
+    joints = self.hand.drive_targets()
+    # Where the tip is told to be, and how it is to be turned: by a wrist, or with the shaft.
+    self.tip, self.turn = wrist.forward(self.trocar, joints)
+    if not self.trocar.wrist:
+      self.tip = trocar.forward(self.trocar, joints[[0, 1, 3]])
+    self.roll = float(joints[2])
     self.extra = np.zeros(len(self.task.other if self._which else self.task.extra))
     late = round(self.style.reaction / self.dt)
-    still = self.tip, self.roll, self.extra.copy()
+    still = self.tip, self.roll, self.turn, self.extra.copy()
     self._told = collections.deque([still] * late, maxlen=late + 1)
     self._phase = self.random.uniform(0, 2 * math.pi, (len(_TREMOR_HZ), 3))
 
   # Words of the scripts.
 
   def step(self) -> np.ndarray:
-    """Returns the action that takes the drives, or the handle, towards `tip`, `roll`, `extra`."""
-    self._told.append((self.tip, self.roll, self.extra.copy()))
-    tip, roll, extra = self._told[0]  # of the moment that the hand follows now
+    """Returns the action that takes drives or handle towards `tip`, `roll`, `turn`, `extra`."""
+    self._told.append((self.tip, self.roll, self.turn, self.extra.copy()))
+    tip, roll, turn, extra = self._told[0]  # of the moment that the hand follows now
     if self.style.tremor:
       wave = np.sin(2 * math.pi * _TREMOR_HZ[:, None] * self.physics.time() + self._phase)
       tip = tip + self.style.tremor * math.sqrt(2 / len(_TREMOR_HZ)) * wave.sum(axis=0)
+    bent = bool(self.trocar.wrist)
     if self.hand.handle:
-      return np.concatenate([self.hand.handle_row(tip, roll), extra])
-    pitch, yaw, insertion = trocar.inverse(self.trocar, tip, check=False)
-    goal = self.drive(np.array([pitch, yaw, roll, insertion]))
-    move = (goal - self.hand.drive_targets()) / (np.array(RATES) * self.dt)
+      row = [*tip, *laparoscope.orientation(turn)] if bent else self.hand.handle_row(tip, roll)
+      return np.concatenate([row, extra])
+    if bent:
+      goal = wrist.inverse(self.trocar, tip, turn, float(self.hand.drive_targets()[2]))
+    else:
+      pitch, yaw, insertion = trocar.inverse(self.trocar, tip, check=False)
+      goal = np.array([pitch, yaw, roll, insertion])
+    goal = self.drive(goal)
+    move = (goal - self.hand.drive_targets()) / (np.array(RATES[: len(goal)]) * self.dt)
     return np.concatenate([np.clip(move, -1, 1), extra])
 
   def drive(self, goal: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from ..learn.portable import Portable
 from ..metrics.samples import Stretch
 from . import scenes
 from .engine import wrap
-from .instrument import AXES, JAWS, SCOPE, Instrument, Second
+from .instrument import SCOPE, Instrument, Second, axes, jawed
 from .scenes import CAMERA, GUIDED, LIGHT, ORGAN
 from .stage import STATE
 
@@ -342,8 +342,8 @@ def check_scene(
   model: mj.MjModel, prefix: str, targets: int, organ: str, handle: bool = False
 ) -> None:
   """Raises ValueError naming what a scene lacks for an exercise; arguments as `Physics.use`."""
-  jaw, touch = (("jaw",), ("jaw", "touch_left", "touch_right")) if prefix == JAWS else ((), ())
-  drives = () if handle else AXES
+  jaw, touch = (("jaw",), ("jaw", "touch_left", "touch_right")) if jawed(prefix) else ((), ())
+  drives = () if handle else axes(prefix)
   for kind, names in (
     ("body", [f"{prefix}trocar", *([f"{prefix}handle"] if handle else [])]),
     ("site", [f"{prefix}tip", *(f"target{i}" for i in range(targets))]),

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 import palpate
-from palpate.models import catalog, laparoscope, mjcf, scenery, shapes, situs, trocar
+from palpate.models import catalog, laparoscope, markup, mjcf, scenery, shapes, situs, trocar
 from palpate.models.catalog import Tissue
 from palpate.tissue.geometry.mesh import vertex_normals
 
@@ -28,7 +28,7 @@ BED = "bed"  # patch of the gallbladder, and the body that is in the liver's pla
 CAMERA = "laparoscope"
 GUIDED = "guided/"  # prefix of an instrument that the exercise itself moves
 LIGHT = situs.LIGHT
-INPUTS = ("drives", "handle")
+INPUTS = ("drives", "handle", "tip")
 SURROUNDINGS = ("abdomen", "unseen", "none")
 # The organ's solref counts, not the instrument's: light nodes want stiff contacts.
 CONTACT = {
@@ -41,9 +41,9 @@ CONTACT = {
 # Residual of the organ's solve; 1e-4, the plugin's own, changes contact forces by 0.1 %.
 TOLERANCE = 1e-2
 # Slots of the organ's window for each 1000 nodes; the experts' instruments touch 15 and 38 at most.
-_SLOTS = {"probe": 40, "grasper": 48, "scalpel": 40, "hook": 24, "laparoscope": 40}
+_SLOTS = {"probe": 40, "grasper": 48, "scalpel": 40, "hook": 24, "laparoscope": 40, "psm": 40}
 # More than MuJoCo's 1 makes friction creep less: 2.4 N of grip then hold 3 N, with 3 only 2 N.
-_IMPRATIO = {"probe": 3, "grasper": 10, "scalpel": 3, "laparoscope": 3}
+_IMPRATIO = {"probe": 3, "grasper": 10, "scalpel": 3, "laparoscope": 3, "psm": 100}
 # Foundation of an organ that comes away from its bed [Pa/m]; ours: what lies around it lets go too.
 _LOOSE = 3e3
 _FILM = (0.0045, 0.0045, 0.0012)  # of the film where a bond is, and of the raw bed [m]
@@ -63,7 +63,7 @@ class Scene:
 
   Attributes:
     organ: one of `TISSUES`
-    instrument: `probe`, `grasper`, `scalpel` or the `laparoscope`, which then has the camera
+    instrument: `probe`, `grasper`, `scalpel`, `psm` or the `laparoscope`, which then has the camera
     nodes: number of the organ's nodes
     variant: seed of the organ's shape, None for the mean shape
     center: the organ's landmark that ports and camera look at
@@ -77,7 +77,8 @@ class Scene:
     targets: number of target sites
     inclusion: hidden stiff place: position in the world [m] (3), radius [m], factor on Young's
       modulus; None for healthy tissue. Without gravity: the organ would sag less where it is stiff
-    handle: whether a handle pulls the instrument in place of position drives
+    input: what an action moves: position `drives`, a `handle` that pulls the instrument, or the
+      pose of its `tip`, which inverse kinematics turns into targets of the drives
     bonds: stiffness [N/m^3], strength [Pa], energy [J/m^2] of what holds the organ in its bed; None
       where it is pinned there
     surroundings: what is around the organ, one of SURROUNDINGS: an abdomen that instruments meet,
@@ -98,14 +99,21 @@ class Scene:
   guided_port: tuple[float, float, float] = (0.06, 0.05, 0.12)
   targets: int = 1
   inclusion: tuple[float, ...] | None = None
-  handle: bool = False
+  input: str = "drives"
   bonds: tuple[float, float, float] | None = None
   surroundings: str = "abdomen"
 
   @property
   def prefixes(self) -> tuple[str, str]:
     """Prefixes of the instruments; "" in place of the second where there is none."""
-    return f"{self.instrument}/", f"{self.second}/" if self.second else ""
+    names = [self.instrument, self.second] if self.second else [self.instrument]
+    first, *other = markup.prefixes(names)
+    return first, other[0] if other else ""
+
+  @property
+  def handle(self) -> bool:
+    """Whether a handle pulls the instruments in place of position drives."""
+    return self.input == "handle"
 
 
 def chosen(scene: Scene, input: str, nodes: int | None, surroundings: str | None) -> Scene:
@@ -117,12 +125,15 @@ def chosen(scene: Scene, input: str, nodes: int | None, surroundings: str | None
     raise ValueError(f"surroundings is {surroundings!r}, expected one of {choices}")
   if input not in INPUTS:
     raise ValueError(f"input is {input!r}, expected one of {', '.join(INPUTS)}")
+  bent = [name for name in (scene.instrument, scene.second) if name in trocar.WRISTED]
+  if bent and input == "handle":
+    raise ValueError(f"input is 'handle', which a {bent[0]} has not, expected drives or tip")
   if nodes is None:
     nodes = scene.nodes
   if not (isinstance(nodes, int) and 100 <= nodes <= 20000):
     raise ValueError(f"nodes is {nodes!r}, expected a whole number in [100, 20000], or None")
   return dataclasses.replace(
-    scene, handle=input == "handle", nodes=nodes, surroundings=surroundings
+    scene, input=input, nodes=nodes, surroundings=surroundings
   )
 
 
@@ -251,12 +262,13 @@ def furnish(
     slots: of the organ's window, None for what experts touch
   """
   spec = mujoco.MjSpec.from_string(_xml(organ, center, scene, bed))
-  for name, offset in ((scene.instrument, scene.port), (scene.second, scene.second_port)):
+  hands = (scene.instrument, scene.port), (scene.second, scene.second_port)
+  for (name, offset), prefix in zip(hands, scene.prefixes, strict=True):
     port = center + offset
     if name == laparoscope.NAME:
       _look(spec, scene, center)
     elif name:
-      trocar.attach(spec, name, f"{name}/", port, trocar.aim(port, center), scene.handle)
+      trocar.attach(spec, name, prefix, port, trocar.aim(port, center), scene.handle)
   touched = sum(_SLOTS[name] for name in (scene.instrument, scene.second) if name)
   slots = slots or touched * max(1, -(-scene.nodes // 1000))
   palpate.add_windows(spec, ORGAN, nodes=slots)

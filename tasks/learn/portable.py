@@ -8,7 +8,7 @@ from typing import Any
 
 import mujoco as mj
 from palpate import Organ
-from palpate.models.handle import Handle, find
+from palpate.models.handle import Handle, Tip
 from palpate.tissue.config import Config
 
 from .. import display
@@ -29,12 +29,12 @@ class Portable(Physics):
     organ: the handle on the organ
     organ_name: its name in the model
     prefix: of the instrument
-    handle: that of the instrument, None where position drives move it
+    handle: that of the instrument, see `Instrument`
   """
 
   organ: Organ
   prefix = ""
-  handle: Handle | None = None
+  handle: Handle | Tip | None = None
   organ_name = ORGAN
 
   @property
@@ -67,6 +67,9 @@ class Portable(Physics):
     super().__setstate__(data)
     self.resume(now, rest, config)
 
+  def take_hold(self) -> None:
+    """See `Instrument`, of which an exercise's physics is one."""
+
   def _others(self) -> dict[str, Any]:
     return {name: value for name, value in vars(self).items() if name not in _OWN}
 
@@ -80,7 +83,8 @@ class Portable(Physics):
     """
     vars(self).update(rest)
     model, own = self.model.ptr, self.data.ptr
-    self.organ, self.handle = Organ(model, own, self.organ_name), find(model, own, self.prefix)
+    self.organ = Organ(model, own, self.organ_name)
+    self.take_hold()
     now = self.organ.config
     names = [field.name for field in dataclasses.fields(Config)]
     changed = {n: getattr(config, n) for n in names if getattr(config, n) != getattr(now, n)}

@@ -288,6 +288,7 @@ def test_bad_input_is_named():
   for options, what in (
     ({"randomise": {"friction": (1, 2)}}, "randomise has 'friction'"),
     ({"record": True}, "record is given"),
+    ({"input": "tip"}, "input is given"),
   ):
     with pytest.raises(ValueError, match=f"{what}.*vectorization_mode"):
       make("touch/easy", **options)

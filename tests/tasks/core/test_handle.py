@@ -31,6 +31,14 @@ def test_the_expert_succeeds_by_handle_and_replays_to_the_bit(name, tmp_path):
   assert episode.differences(old, episode.replay(old)) == []
 
 
+def test_the_expert_succeeds_by_the_pose_of_the_tip_and_replays_to_the_bit(tmp_path):
+  env = load(input="tip")
+  made = episode.run(env, performer.make(env, seed=0), 0, {"task_kwargs": {"input": "tip"}})
+  assert made.outcome == "success"
+  old = Recording.load(made.save(tmp_path / "a.npz"))
+  assert episode.differences(old, episode.replay(old)) == []
+
+
 def test_rows_are_places_evenly_spaced_over_the_step():
   """One row, two on the straight line to it, and one for each step of the physics, are the same."""
   ends = []

@@ -64,10 +64,9 @@ def _progress(kept: Keeping | None) -> dict[str, dict[str, Any]] | None:
 
 def instruments() -> tuple[str, ...]:
   """Returns the instruments of free practice, where the laparoscope is beside them."""
-  from palpate import models
-  from palpate.models import laparoscope
+  from palpate.models import laparoscope, trocar
 
-  return tuple(name for name in models.INSTRUMENTS if name != laparoscope.NAME)
+  return tuple(name for name in trocar.NAMES if name != laparoscope.NAME)
 
 
 def organs(scene: bool) -> tuple[str, ...]:
