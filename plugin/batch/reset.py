@@ -56,6 +56,8 @@ class Rest:
       self.starts += [_start(array) for array in organ.motion.values()]
       zero += [organ.body.state.dvel, organ.patch.stirred]
       zero += [group.arrays["stretch"] for group in organ.forces.of(Bonds).groups]
+    for thread in batch.rods.all.values():
+      self.starts += [_start(array) for array in (thread.twist, thread.force)]
     self._rows = self.starts + [_start(array) for array in zero if array.size]
     self._move = move = kernels.Move()
     for name in kernels.Move.vars:
@@ -98,8 +100,8 @@ class Rest:
   def find(self):
     """Resets and counts the worlds with numbers that are not finite."""
     batch = self.batch
-    for organ in batch.organs.values():
-      organ.find_bad()
+    for each in (*batch.organs.values(), *batch.rods.all.values()):
+      each.find_bad()
     inputs = [batch.bad, self.mask, batch.failures]
     wp.launch(kernels.note, dim=batch.nworld, inputs=inputs, device=batch.device)
     self.launch()

@@ -80,6 +80,8 @@ def pull(batch: Worlds, world: int, data: mujoco.MjData):
   data.time = d.time[world : world + 1].numpy()[0]
   for organ in batch.organs.values():
     _pull_organ(organ, world, model, data)
+  for thread in batch.rods.all.values():
+    thread.pull(world, data)
   engine.place_windows(model, data)
 
 
@@ -171,6 +173,8 @@ def push(batch: Worlds, world: int, data: mujoco.MjData):
   d.time[world : world + 1].assign(np.array([data.time], np.float32))
   for organ in batch.organs.values():
     _push_organ(organ, world, model, data)
+  for thread in batch.rods.all.values():
+    thread.push(world, data)
   host.follow(batch, [world])
 
 

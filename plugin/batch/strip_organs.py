@@ -19,7 +19,7 @@ import numpy as np
 from palpate import windows
 from palpate.engine import contacts
 from palpate.engine.contacts import TISSUE
-from palpate.engine.model import flexes, mjstruct
+from palpate.engine.model import flexes, mjstruct, prepare
 
 from .contact.contacts import KINDS
 
@@ -105,15 +105,18 @@ def _geom(model, g: int) -> str:
 
 
 def strip(
-  spec: mujoco.MjSpec, model: mujoco.MjModel, organs: list, nslots: list[int]
+  spec: mujoco.MjSpec, model: mujoco.MjModel, organs: list, nslots: list[int], threads: list
 ) -> tuple[mujoco.MjModel, list[Slots]]:
   """Returns the model without organs and with slots, and where it has these.
+
+  Threads are flexes without forces of their own, the first ones.
 
   Args:
     spec: the scene
     model: compiled from it
     organs: its organs' declarations
     nslots: slots of each
+    threads: its threads' declarations
   """
   bare = spec.copy()
   for key in list(bare.keys):
@@ -132,8 +135,10 @@ def strip(
   bare.option.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
   _check_option(bare.option)
   made = bare.compile()
-  made.flex_vert[:] = 0.0  # vertices are where their bodies are
-  made.flex_centered[:] = True
+  for flex in range(len(threads), made.nflex):  # slots' vertices are where their bodies are
+    start = made.flex_vertadr[flex]
+    made.flex_vert[start : start + made.flex_vertnum[flex]] = 0.0
+    made.flex_centered[flex] = True
   if made.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
     m = mjstruct.Model.from_address(model._address)
     tissues = [contacts.tissue_of(m, organ) for organ in organs]
@@ -142,6 +147,11 @@ def strip(
   if made.nv <= 60 and made.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON:
     made.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
   _check(model, made, organs, nslots)
+  for flex, thread in enumerate(threads):
+    assert flex == mujoco.mj_name2id(made, mujoco.mjtObj.mjOBJ_FLEX, thread.name)
+    start = made.flex_vertadr[flex]
+    body = made.flex_vertbodyid[start : start + made.flex_vertnum[flex]]
+    prepare.fit_thread(mjstruct.Model.from_address(made._address), flex, body[thread.free])
   slots = []
   for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
     first = made.body(f"{organ.name}_slot_0").id

@@ -22,7 +22,7 @@ from palpate.forces.cohesive_bonds import Bonds
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import host, kernels, states, strip_organs
+from . import host, kernels, rods, states, strip_organs
 from .base import Batch
 from .contact import contacts, convex
 from .contact.fixed_order import FixedOrder, is_enough
@@ -59,14 +59,16 @@ class Worlds(Batch):
   ):
     target = _resolve(device)
     model = spec.compile()
-    if threads := list(instances(model, dim=1)):
-      raise ValueError(f"the scene has thread {threads[0]!r}, expected none in a batch on a GPU")
     super().__init__(model, nworld, target)
     self.scratch = mujoco.MjData(model)  # its plugin knows what the organs are
     spaces = {
       name: engine.find(self.scratch._address, number) for name, number in instances(model).items()
     }
     declared = [w.organ for w in spaces.values()]
+    sewn = [
+      engine.find_thread(self.scratch._address, number)
+      for number in instances(model, dim=1).values()
+    ]
     host.check(spaces.values())
     tools = [strip_organs.tools_of(model, organ) for organ in declared]
     nslots = [
@@ -76,11 +78,13 @@ class Worlds(Batch):
       (strip_organs.nodes_under(model, o, t) > n).any()
       for o, t, n in zip(declared, tools, nslots, strict=True)
     )
-    bare, slots = strip_organs.strip(spec, model, declared, nslots)
+    bare, slots = strip_organs.strip(
+      spec, model, declared, nslots, [w.organ for w in sewn]
+    )
     self._kept, self.bare = strip_organs.kept(model, declared), bare
     self._graphs: dict[str, tuple[Any, Any]] = {}
     with wp.ScopedDevice(target):
-      self._put(bare, nslots, tools, deterministic, spaces)
+      self._put(bare, nslots, tools, deterministic, spaces, sewn)
       self._allocate()
       self.bad, self.lost = wp.zeros(nworld, dtype=int), wp.zeros(nworld, dtype=int)
       self.mask = wp.zeros(nworld, dtype=wp.bool)
@@ -89,6 +93,7 @@ class Worlds(Batch):
         name: Organ(self, w, s, t)
         for (name, w), s, t in zip(spaces.items(), slots, tools, strict=True)
       }
+      self.rods = rods.Rods(self, sewn)
       self.aims = self._join()
       self._rest = Rest(self, bare)
       self._teller = states.Teller(self)
@@ -112,19 +117,21 @@ class Worlds(Batch):
     self._warned = False
     self.reset()
 
-  def _put(self, bare, nslots, tools, deterministic, spaces):
+  def _put(self, bare, nslots, tools, deterministic, spaces, sewn):
     """Makes mujoco_warp's model and data."""
     model, nworld = self.model, self.nworld
     self.paired = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     most = [contacts.most_of(model, t, n) for t, n in zip(tools, nslots, strict=True)]
     condim = int(max([1, *model.flex_condim, *model.geom_condim]))
     each = 1 if condim == 1 else 2 * (condim - 1) if self.paired else condim
+    most += [rods.most_contacts(w) for w in sewn]
     between = _CONTACTS if strip_organs.tools_meet(bare) else 0
     self.njmax = strip_organs.rows_of(bare) + (between + sum(most)) * each
     ncon = between + sum(most)
     size = states.bytes_of(bare, self.njmax, ncon) + sum(
       Organ.bytes_of(w, self.device) for w in spaces.values()
     )
+    size += sum(map(rods.bytes_of, sewn))
     size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
     devices.refuse_crowd(nworld, size, devices.room_of(self.device), str(self.device))
     if deterministic:  # which is what `fixed_order` knows
@@ -137,8 +144,9 @@ class Worlds(Batch):
       raise ValueError(f"mujoco_warp cannot have this scene: {error}") from None
     start = mujoco.MjData(bare)
     mujoco.mj_forward(bare, start)
-    # A row has the three slots of a triangle, and whatever hangs on a tool.
-    nonzero = self.njmax * (bare.nv - 3 * sum(nslots) + 9)
+    # A row has the three slots of a triangle, two nodes of a thread, and whatever hangs on a tool.
+    nodes = sum(int(w.organ.free.sum()) for w in sewn)
+    nonzero = self.njmax * (bare.nv - 3 * (sum(nslots) + nodes) + 9 + 6 * bool(sewn))
     self.d = mjw.put_data(
       bare, start, nworld=nworld, nconmax=ncon, njmax=self.njmax, njmax_nnz=nonzero
     )
@@ -151,12 +159,13 @@ class Worlds(Batch):
     # All worlds wait for the one that takes longest.
     most = _CROWDED if self._crowded else _ITERATIONS
     self.m.opt.iterations = min(self.m.opt.iterations, most)
-    ordered = deterministic and is_enough(self.m, bare)
+    ordered = deterministic and not sewn and is_enough(self.m, bare)
     self._order = FixedOrder(self.m, self.d) if ordered else None
     sorted_by_warp = deterministic and not ordered
     self.m.opt.deterministic = int(DeterminismType.ALL if sorted_by_warp else DeterminismType.NONE)
-    # The windows' triangles have no forces and contacts of mujoco_warp's own.
-    self.m.nflexelem = self.m.nflexedge = 0
+    # The windows' triangles have no forces and contacts of mujoco_warp's own, threads contacts alone.
+    self.m.nflexedge, self.m.nflexelem = 0, sum(len(w.organ.rest) - 1 for w in sewn)
+    self.m.nflex = len(sewn) or self.m.nflex
     gravity = np.tile(model.opt.gravity, (nworld, 1)).astype(np.float32)
     self.m.opt.gravity = wp.array(gravity, dtype=wp.vec3)
 
@@ -201,6 +210,7 @@ class Worlds(Batch):
         self._order.sort()
       for organ in organs:
         organ.push()
+      self.rods.begin()
 
     self.m.callback.contactfilter = touch
     self.m.callback.passive = push
@@ -223,6 +233,8 @@ class Worlds(Batch):
     """Launches the part after it."""
     for organ in self._organs.values():
       organ.end()
+    for thread in self.rods.all.values():
+      thread.end()
 
   def _once(self):
     self.begin()
@@ -255,8 +267,8 @@ class Worlds(Batch):
     work = {"step": self._once, "after": self._after}
     work |= {"reset": self._rest.launch, "look": self._rest.look}
     if not self.device.is_cuda:
-      for organ in self._organs.values():
-        organ.load()
+      for each in (*self._organs.values(), *self.rods.all.values()):
+        each.load()
       self._graphs = {name: (None, each) for name, each in work.items()}
       return
     if not self._graphs:  # loads the kernels; what it does to the worlds, their first reset undoes

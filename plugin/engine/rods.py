@@ -17,7 +17,7 @@ from palpate.tissue import device as devices
 from palpate.tissue import rod
 from palpate.tissue.config import Config
 from palpate.tissue.kernels import kernel
-from palpate.tissue.types import Array, doubles, fill, ints, struct
+from palpate.tissue.types import Array, Views, doubles, fill, ints, struct
 
 from . import contacts, coupling, graphs, layout
 from .coupling import Mujoco
@@ -119,9 +119,9 @@ class Bound:
   M_colind: ints("nC")
 
 
-_CONSTANTS = contacts.CONSTANTS | {"CORE": CORE, "NEIGHBOURS": NEIGHBOURS}
+CONSTANTS = contacts.CONSTANTS | {"CORE": CORE, "NEIGHBOURS": NEIGHBOURS}
 begin, end = (
-  kernel(name, "coupling/mujoco_rod.h", Bound, _CONSTANTS) for name in ("begin_rod", "end_rod")
+  kernel(name, "coupling/mujoco_rod.h", Bound, CONSTANTS) for name in ("begin_rod", "end_rod")
 )
 
 
@@ -247,6 +247,12 @@ def scratch(n: int) -> dict[str, np.ndarray]:
   )
 
 
+def state_of(state: np.ndarray, n: int) -> Views:
+  """Returns `RodState` of a thread of n nodes, as views of its part of a plugin state."""
+  array = wp.array(state, dtype=wp.float64, device="cpu", copy=False)
+  return Views(layout.carve(RodState, array, {"nvert": n}))
+
+
 def _check(m, flex: int, name: str):
   """Raises ValueError where a flex cannot be a thread."""
   dim = mjstruct.view(m.flex_dim, m.nflex, np.int32)[flex]
@@ -275,6 +281,8 @@ class Workspace:
   Attributes:
     fields: what its kernels take
     constants: those of them that follow from configuration and shape, see `rod.constants`
+    mass: of its nodes [kg]  (nvert,)
+    friction: on itself
     own: its numbers in mjData.plugin_state
     seen, report: as of an organ
   """
@@ -295,11 +303,11 @@ class Workspace:
     own_dof = np.full(m.nv, -1)
     own_dof[organ.dofs] = (3 * np.flatnonzero(organ.free)[:, None] + np.arange(3)).ravel()
     mass = mjstruct.view(m.body_mass, m.nbody)[organ.body]
-    mass = np.where(organ.free, mass, mass[organ.free].mean())
-    friction = float(mjstruct.view(m.flex_friction, (m.nflex, 3))[organ.flex, 0])
+    self.mass = mass = np.where(organ.free, mass, mass[organ.free].mean())
+    self.friction = float(mjstruct.view(m.flex_friction, (m.nflex, 3))[organ.flex, 0])
     self.constants = rod.constants(organ.rest, organ.radius, organ.config, mass, organ.clamped)
     self.own = layout.carve(RodState, self.state, sizes)
-    values = self.constants | settings(organ, friction) | scratch(n)
+    values = self.constants | settings(organ, self.friction) | scratch(n)
     own = fill(Rod, "cpu", values | {"mass": mass, "own": self.own})
     values = dict(
       rod=own,

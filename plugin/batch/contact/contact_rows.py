@@ -152,6 +152,31 @@ def _firm_up(p: Pressed, world: int, c: int):
   return rate
 
 
+@wp.func
+def parting(
+  paired: int,
+  n: int,
+  c: int,
+  world: int,
+  friction: wp.array[vec5],
+  row: wp.array2d[int],
+  aref: wp.array2d[float],
+):
+  """Returns how fast a contact of n dimensions that slides is braked, times friction [m/s^2].
+
+  See `parting` of coupling/contact_rows.h.
+  """
+  square = float(0.0)  # noqa: UP018 - a variable to Warp
+  for r in range(n - 1):
+    if paired == 1:
+      v = 0.5 * (aref[world, row[c, 2 * r]] - aref[world, row[c, 2 * r + 1]])
+      square += v * v
+    else:
+      v = friction[c][r] * aref[world, row[c, r + 1]]
+      square += v * v
+  return wp.sqrt(square)
+
+
 @wp.kernel(enable_backward=False)
 def _closed(p: Pressed):
   """Makes contacts firm, and takes the parting of those that slide off their reference."""
@@ -163,18 +188,10 @@ def _closed(p: Pressed):
   if not _has_rows(p, c):
     return
   off = _firm_up(p, world, c)
-  square = float(0.0)  # noqa: UP018 - a variable to Warp
-  for r in range(n - 1):
-    if p.paired == 1:
-      plus = p.aref[world, p.efc_address[c, 2 * r]]
-      v = 0.5 * (plus - p.aref[world, p.efc_address[c, 2 * r + 1]])
-      square += v * v
-    else:
-      v = p.friction[c][r] * p.aref[world, p.efc_address[c, r + 1]]
-      square += v * v
+  part = parting(p.paired, n, c, world, p.friction, p.efc_address, p.aref)
   for r in range(wp.where(p.paired == 1, _rows(p, c), 1)):
     row = p.efc_address[c, r]
-    p.aref[world, row] = p.aref[world, row] - wp.sqrt(square) - off
+    p.aref[world, row] = p.aref[world, row] - part - off
 
 
 def keep_closed(p, device):

@@ -11,6 +11,7 @@ struct D3 { double x, y, z; };
 PALPATE D3 load(const double* p) { return {p[0], p[1], p[2]}; }
 PALPATE D3 load(const float* p) { return {p[0], p[1], p[2]}; }
 PALPATE void store(double* p, D3 a) { p[0] = a.x; p[1] = a.y; p[2] = a.z; }
+PALPATE void store(float* p, D3 a) { p[0] = (float)a.x; p[1] = (float)a.y; p[2] = (float)a.z; }
 
 // A node's numbers in a vector of slices; they start at `offset_of(node)`.
 PALPATE int offset_of(int node) { return node / LANES * 3 * LANES + node % LANES; }

@@ -19,13 +19,6 @@ constexpr float HELD = -1e3f;
 // Where a slot waits that no node has [m], and its inertia then [kg].
 constexpr float WAITING = 1e3f, IDLE = 1.0f;
 
-// Three floats of mujoco_warp's, as doubles.
-PALPATE D3 load_floats(const float* p) { return {p[0], p[1], p[2]}; }
-PALPATE void store_floats(float* p, D3 a) {
-  p[0] = (float)a.x;
-  p[1] = (float)a.y;
-  p[2] = (float)a.z;
-}
 // R^T x.
 PALPATE D3 turned_back(const double* R, D3 x) { return add_turned({0.0, 0.0, 0.0}, R, x); }
 
@@ -66,7 +59,7 @@ PALPATE double mass_of(const Fields& f, int world, int i) {
 }
 template <class Fields>
 PALPATE D3 gravity(const Fields& f, int world) {
-  return load_floats((const float*)f.gravity.data + (f.ngravity > 1 ? 3 * world : 0));
+  return load((const float*)f.gravity.data + (f.ngravity > 1 ? 3 * world : 0));
 }
 template <class Fields>
 PALPATE bool succeeded(const Fields& f, int world) {
@@ -96,7 +89,7 @@ PALPATE double inertia_of(const Fields& f, int world, int i) {
   const double t = grade - k, low = f.inertia.data[k * f.nnode + source];
   const double more = t * (f.inertia.data[(k + 1) * f.nnode + source] - low);
   const double total = f.mass_scale.data[world] * share_of(f, world, i) * (low + more);
-  const D3 force = load_floats(f.force.data + 3 * in_row(f, world, i));
+  const D3 force = load(f.force.data + 3 * in_row(f, world, i));
   return touched(force) && f.heavier.data[world] > 1.0 ? f.heavier.data[world] * total : total;
 }
 
@@ -111,7 +104,7 @@ PALPATE void tell_tools(const Fields& f, Thread t, int) {
   each_item(t, f.ntool, [&](int q) {
     const size_t g = (size_t)t.world * f.ngeom + f.tool_geom.data[q];
     const float* R = (const float*)f.geom_xmat.data + 9 * g;
-    const D3 from = load_floats((const float*)f.geom_xpos.data + 3 * g) - load(f.origin.data);
+    const D3 from = load((const float*)f.geom_xpos.data + 3 * g) - load(f.origin.data);
     double* tool = f.tool.data + (size_t)GEOM_LENGTH * (t.world * f.ntool + q);
     store(tool + GEOM_POS, turned_back(f.frame.data, from));
     for (int a = 0; a < 3; ++a)
@@ -136,7 +129,7 @@ PALPATE void enter_worlds(const Fields& f, Thread t, int) {
   each_item(t, f.nnode, [&](int i) {
     const size_t at = at_node(f, w, i);
     const D3 last = load_lane(f.last.data + at), before = load_lane(f.before.data + at);
-    const D3 contact = load_floats(f.force.data + 3 * in_row(f, w, i));
+    const D3 contact = load(f.force.data + 3 * in_row(f, w, i));
     store_lane(f.solve.dvel_warm.data + at, forecast(last, before));
     store_lane(f.solve.force_ext.data + at, (masses * mass_of(f, w, i)) * g + contact);
     f.node_slot.data[in_row(f, w, i)] = -1;
@@ -172,9 +165,9 @@ template <class Fields>
 PALPATE void wait(const Fields& f, int world, int slot) {
   const int adr = slot_dof(f, world, slot);
   f.slot_node.data[world * f.nslot + slot] = -1;
-  store_floats(f.qpos.data + (size_t)world * f.nq + f.qposadr + 3 * slot, {0.0, 0.0, WAITING});
-  store_floats(f.qvel.data + adr, {0.0, 0.0, 0.0});
-  store_floats(f.dof_armature.data + adr, {IDLE, IDLE, IDLE});
+  store(f.qpos.data + (size_t)world * f.nq + f.qposadr + 3 * slot, {0.0, 0.0, WAITING});
+  store(f.qvel.data + adr, {0.0, 0.0, 0.0});
+  store(f.dof_armature.data + adr, {IDLE, IDLE, IDLE});
 }
 
 // Puts a slot on a node, with its motion and effective inertia.
@@ -186,11 +179,11 @@ PALPATE void stand_on(const Fields& f, int world, int slot, int i) {
   f.node_slot.data[in_row(f, world, i)] = slot;
   const D3 x = at_rest(f, world, i) + load_lane(f.solve.disp.data + at);
   const D3 v = load_lane(f.solve.vel.data + at);
-  store_floats(f.qpos.data + (size_t)world * f.nq + f.qposadr + 3 * slot,
+  store(f.qpos.data + (size_t)world * f.nq + f.qposadr + 3 * slot,
                load(f.origin.data) + turned(f.frame.data, x));
-  store_floats(f.qvel.data + adr, turned(f.frame.data, v));
+  store(f.qvel.data + adr, turned(f.frame.data, v));
   const double more = inertia_of(f, world, i) - f.slot_mass;
-  store_floats(f.dof_armature.data + adr, {more, more, more});
+  store(f.dof_armature.data + adr, {more, more, more});
   float* inverse = (float*)f.body_invweight0.data + 2 * (world * f.nbody + f.bodyid + slot);
   inverse[0] = (float)(1.0 / (f.mass_scale.data[world] * of_mesh(f.held, f.mesh.data[world])[i]));
 }
@@ -223,16 +216,16 @@ PALPATE void push_worlds(const Fields& f, Thread t, int) {
       const double Mhat = f.slot_mass + f.dof_armature.data[adr];
       const D3 dv = load_lane(f.solve.dvel.data + at_node(f, t.world, i));
       if (succeeded(f, t.world)) rate = (Mhat / f.h) * turned(f.frame.data, dv);
-      contact = turned(f.frame.data, load_floats(f.force.data + 3 * in_row(f, t.world, i)));
+      contact = turned(f.frame.data, load(f.force.data + 3 * in_row(f, t.world, i)));
     }
-    store_floats(f.qfrc_passive.data + adr, passive(rate, contact + weight));
+    store(f.qfrc_passive.data + adr, passive(rate, contact + weight));
   });
 }
 
 // The contact force on a slot's node that MuJoCo found.
 template <class Fields>
 PALPATE D3 contact_now(const Fields& f, int world, int slot, int i) {
-  const D3 found = load_floats(f.qfrc_constraint.data + slot_dof(f, world, slot));
+  const D3 found = load(f.qfrc_constraint.data + slot_dof(f, world, slot));
   return f.free.data[i] ? turned_back(f.frame.data, found) : D3{0.0, 0.0, 0.0};
 }
 
@@ -244,9 +237,9 @@ PALPATE void take(const Fields& f, Thread t, int) {
     const int i = f.slot_node.data[t.world * f.nslot + k];
     if (i < 0) return;
     const D3 now = contact_now(f, t.world, k, i);
-    store_floats(f.found.data + 3 * (t.world * f.nslot + k), now);
+    store(f.found.data + 3 * (t.world * f.nslot + k), now);
     if (!f.stiff) return;
-    const D3 change = now - load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    const D3 change = now - load(f.force.data + 3 * in_row(f, t.world, i));
     store_lane(f.solve.rhs.data + at_node(f, t.world, i), (double)f.h * change);
   });
   if (t.tid > 0 || !f.stiff) return;
@@ -255,7 +248,7 @@ PALPATE void take(const Fields& f, Thread t, int) {
     const int i = f.slot_node.data[t.world * f.nslot + k];
     if (i < 0) continue;
     const D3 now = contact_now(f, t.world, k, i);
-    const D3 was = load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    const D3 was = load(f.force.data + 3 * in_row(f, t.world, i));
     const double Mhat = f.slot_mass + f.dof_armature.data[slot_dof(f, t.world, k)];
     expected.add((double)f.h * (now - was), Mhat, was, now);
   }
@@ -272,9 +265,9 @@ PALPATE void follow(const Fields& f, Thread t, int) {
     const int i = f.slot_node.data[t.world * f.nslot + k];
     if (i < 0) continue;
     float* found = f.found.data + 3 * (t.world * f.nslot + k);
-    const D3 now = load_floats(found), was = load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    const D3 now = load(found), was = load(f.force.data + 3 * in_row(f, t.world, i));
     secant.add(now - was, norm(now));
-    store_floats(found, relaxed(was, now, ratio));
+    store(found, relaxed(was, now, ratio));
   }
   double* heavier = f.heavier.data + t.world;
   *heavier = secant.heavier(*heavier > 1.0 ? *heavier : 1.0, f.heaviest, ratio);
@@ -298,15 +291,15 @@ PALPATE void commit_worlds(const Fields& f, Thread t, int) {
     D3 v = load_lane(f.solve.vel.data + at) + dv;
     if (asleep) v = dv = now;
     if (slot >= 0) {
-      now = load_floats(f.found.data + 3 * (w * f.nslot + slot));
+      now = load(f.found.data + 3 * (w * f.nslot + slot));
       if (!f.stiff)
-        v = turned_back(f.frame.data, load_floats(f.qvel.data + slot_dof(f, w, slot)));
+        v = turned_back(f.frame.data, load(f.qvel.data + slot_dof(f, w, slot)));
     }
     store_lane(f.solve.disp.data + at, load_lane(f.solve.disp.data + at) + h * v);
     store_lane(f.solve.vel.data + at, v);
     store_lane(f.before.data + at, asleep ? now : load_lane(f.last.data + at));
     store_lane(f.last.data + at, dv);
-    store_floats(f.force.data + 3 * in_row(f, w, i), now);
+    store(f.force.data + 3 * in_row(f, w, i), now);
     if (touched(now) || dot(v, v) > f.slow * f.slow) f.stirred.data[w] = 1;
   });
 }

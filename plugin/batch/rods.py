@@ -1,0 +1,360 @@
+"""Threads in the worlds of a batch on a device: each world has a `Rod`, and kernels take them all.
+
+mujoco_warp has a thread's nodes as bodies and finds its contacts with geoms. Between its rows of
+constraints and its solver the thread takes its step (`coupling/world_rods.h`).
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import functools
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.engine import contacts, rods
+from palpate.engine.layout import RodState
+from palpate.engine.rods import Rod
+from palpate.tissue.kernels import kernel
+from palpate.tissue.types import Array, doubles, fill, floats, ints, struct
+
+from .contact.contact_rows import parting
+from .private import contact_kbimp, vec5
+
+if TYPE_CHECKING:
+  from .worlds import Worlds
+
+_EACH = 2  # contacts of an edge with geoms, and as many more of a thread
+_BEYOND = 16
+_LANES = 32  # threads of a world
+
+
+@struct
+class WorldRods:
+  """A thread in all worlds, and mujoco_warp's arrays under their own names."""
+
+  rods: Array(Rod, ("nworld",))
+  nv: int
+  flex: int  # its flex
+  sparse: int  # whether rows have the columns that they need alone
+  falls: int  # whether there is gravity
+  joined: int  # whether equalities may act on it
+  timestep: wp.float64
+  impratio: wp.float64
+  rest: doubles("nnode", 3)  # rest position in the slides' axes [m]
+  frame: doubles(3, 3)  # rotation from the slides' axes to the world
+  dofadr: ints("nnode")  # first dof of a node, -1 for pinned ones
+  qposadr: ints("nnode")  # its first number in qpos
+  bodyid: ints("nnode")  # its body
+  massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
+  own_dof: ints("nv")  # number of a dof in the rod: three times the node, and the axis; or -1
+  qpos0: floats("nq")
+  # What worlds have of their own:
+  now: doubles("nworld", "nnode", 3)  # place in the slides' axes [m]
+  speed: doubles("nworld", "nnode", 3)  # velocity [m/s]
+  factor: doubles("nworld", "nC")  # of M, as MuJoCo's qLD
+  inverse_diagonal: doubles("nworld", "nv")  # of that, as qLDiagInv
+  solution: doubles("nworld", "nv")  # scratch
+  bad: ints("nworld")  # whether a number is not finite
+  # mujoco_warp's model:
+  gravity: Array(wp.vec3, ("nworld",))
+  M_rowadr: ints("nv")
+  M_rownnz: ints("nv")
+  M_colind: ints("nC")
+  # Its data:
+  qpos: floats("nworld", "nq")
+  qvel: floats("nworld", "nv")
+  qfrc_applied: floats("nworld", "nv")
+  xfrc_applied: Array(wp.spatial_vector, ("nworld", "nbody"))
+  qfrc_passive: floats("nworld", "nv")
+  qfrc_constraint: floats("nworld", "nv")
+  qacc_warmstart: floats("nworld", "nv")
+  M: floats("nworld", "nC")
+  nefc: ints("nworld")
+  contact_dim: ints("naconmax")
+  contact_flex: Array(wp.vec2i, ("naconmax",))
+  contact_friction: Array(vec5, ("naconmax",))
+  # Its rows of constraints:
+  type: ints("nworld", "njmax")
+  id: ints("nworld", "njmax")
+  J: floats("nworld", "nrow", "ncolumn")
+  J_rownnz: ints("nworld", "njmax")
+  J_rowadr: ints("nworld", "njmax")
+  J_colind: ints("nworld", "nrow", "ncolumn")
+  D: floats("nworld", "njmax")
+  aref: floats("nworld", "njmax")
+
+
+_CONSTANTS = rods.CONSTANTS | {"IS_CONTACT": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)}
+_begin, _end, _find_bad = (
+  kernel(name, "coupling/world_rods.h", WorldRods, _CONSTANTS)
+  for name in ("begin_rods", "end_rods", "find_bad_rods")
+)
+
+
+@struct
+class Closed:
+  """Contacts of threads in mujoco_warp's arrays, which are there before they touch."""
+
+  nthread: int  # flexes that are threads, the first ones
+  paired: int  # whether the cone is a pyramid
+  disableflags: int  # of mjOption
+  discrete: int  # whether the integrator is
+  timestep: float  # [s]
+  margin: floats("nthread")  # of each thread [m]
+  nacon: ints(1)
+  dim: ints("naconmax")
+  flex: Array(wp.vec2i, ("naconmax",))
+  worldid: ints("naconmax")
+  dist: floats("naconmax")
+  includemargin: floats("naconmax")
+  friction: Array(vec5, ("naconmax",))
+  solref: Array(wp.vec2, ("naconmax",))
+  solimp: Array(vec5, ("naconmax",))
+  efc_address: ints("naconmax", "nrow")
+  aref: floats("nworld", "njmax")
+
+
+@wp.kernel(enable_backward=False)
+def _close(f: Closed):
+  """Takes margin and parting off the gaps of threads' contacts, see `keep_closed`."""
+  c = wp.tid()
+  if c >= f.nacon[0]:
+    return
+  thread = wp.max(f.flex[c][0], f.flex[c][1])
+  if thread >= f.nthread:
+    thread = wp.min(f.flex[c][0], f.flex[c][1])
+  if thread < 0 or thread >= f.nthread:
+    return
+  n = f.dim[c]
+  rows = wp.where(f.paired == 1 and n > 1, 2 * (n - 1), n)
+  for r in range(rows):
+    if f.efc_address[c, r] < 0:
+      return
+  gap = f.dist[c] - f.includemargin[c]
+  spring = contact_kbimp(
+    f.disableflags, f.timestep, f.solref[c], f.solimp[c], gap, f.discrete == 1
+  )
+  world = f.worldid[c]
+  off = spring[0] * spring[2] * f.margin[thread]
+  off += parting(f.paired, n, c, world, f.friction, f.efc_address, f.aref)
+  for r in range(wp.where(f.paired == 1, rows, 1)):
+    row = f.efc_address[c, r]
+    f.aref[world, row] = f.aref[world, row] - off
+
+
+@wp.kernel(enable_backward=False)
+def _show(f: WorldRods, origin: wp.vec3, out: wp.array2d[wp.vec3]):
+  """Writes where nodes are in the world."""
+  w, i = wp.tid()
+  x = wp.vec3()
+  for a in range(3):
+    for c in range(3):
+      x[a] += float(f.frame[a, c] * f.now[w, i, c])
+  out[w, i] = origin + x
+
+
+def most_contacts(space: rods.Workspace) -> int:
+  """Returns how many contacts with geoms a world has room for."""
+  return _EACH * len(space.organ.rest) + _BEYOND
+
+
+def bytes_of(space: rods.Workspace) -> float:
+  """Returns about how many bytes a world takes of a thread."""
+  return float(sum(8 * each.size for each in rods.scratch(len(space.organ.rest)).values()))
+
+
+class Thread:
+  """A thread in all worlds of a batch.
+
+  Attributes:
+    name: of its flexcomp
+    xpos: places of its nodes [m], (nworld, nnode, 3)
+  """
+
+  def __init__(self, batch: "Worlds", space: rods.Workspace):
+    organ, bare, device, nworld = space.organ, batch.bare, batch.device, batch.nworld
+    self.name, self.space, self.declared, self._batch = organ.name, space, organ, batch
+    n, m, d = len(organ.rest), batch.m, batch.d
+    kept_qpos, kept_dof = batch.kept
+    dofadr = np.where(organ.free, np.searchsorted(kept_dof, organ.dofadr), -1)
+    dofs = np.maximum(dofadr, 0)[:, None] + np.arange(3)
+    own_dof = np.full(bare.nv, -1)
+    moving = np.flatnonzero(organ.free)[:, None]
+    own_dof[dofs[organ.free]] = 3 * moving + np.arange(3)
+    mass = space.mass
+    shared = space.constants | rods.settings(organ, space.friction) | {"mass": mass}
+    self.twist, self.force = (
+      wp.zeros((nworld, n, *more), dtype=wp.float64, device=device) for more in ((), (3,))
+    )
+    own = {"twist": self.twist, "force": self.force}
+    own["signature"] = wp.zeros((nworld, 1), dtype=wp.float64, device=device)
+    each = {name: _rows(Rod, name, start, nworld, device) for name, start in rods.scratch(n).items()}
+    self.iterations = each["status"]
+    values: dict[str, Any] = dict(
+      rods=_stack(shared | each | {"own": own}, nworld, device),
+      nv=bare.nv,
+      flex=mujoco.mj_name2id(bare, mujoco.mjtObj.mjOBJ_FLEX, organ.name),
+      sparse=int(m.is_sparse),
+      falls=int(not bare.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY),
+      joined=int(bare.neq > 0),
+      timestep=float(bare.opt.timestep),
+      impratio=float(bare.opt.impratio),
+      rest=organ.rest,
+      frame=organ.frame,
+      dofadr=dofadr,
+      qposadr=np.where(organ.free, np.searchsorted(kept_qpos, organ.qposadr), -1),
+      bodyid=batch.numbers[organ.body],
+      massadr=np.where(organ.free[:, None], (bare.M_rowadr + bare.M_rownnz - 1)[dofs], -1),
+      own_dof=own_dof,
+      qpos0=bare.qpos0,
+      now=np.tile(organ.rest, (nworld, 1, 1)),
+      speed=np.zeros((nworld, n, 3)),
+      factor=np.zeros((nworld, bare.nC)),
+      inverse_diagonal=np.zeros((nworld, bare.nv)),
+      solution=np.zeros((nworld, bare.nv)),
+      bad=batch.bad,
+      gravity=m.opt.gravity,
+      **{name: getattr(bare, name) for name in ("M_rowadr", "M_rownnz", "M_colind")},
+      **{f"contact_{name}": getattr(d.contact, name) for name in ("dim", "flex", "friction")},
+    )
+    for name in WorldRods.vars:
+      if name not in values:
+        values[name] = getattr(d if hasattr(d, name) else d.efc, name)
+    self.fields: Any = fill(WorldRods, device, values)
+    self.origin = wp.vec3(*organ.origin)
+
+  def load(self):
+    """Loads the kernels, compiling them where the cache has none."""
+    for each in (_begin, _end, _find_bad):
+      each.load(self._batch.device)
+
+  def _over(self, each):
+    device = self._batch.device
+    each.launch(device, self._batch.nworld, _LANES if device.is_cuda else 1, 0, self.fields, _LANES)
+
+  def begin(self):
+    """Takes the thread's step and adds it to the passive forces."""
+    self._over(_begin)
+
+  def end(self):
+    """Ends the step after mujoco_warp has moved."""
+    self._over(_end)
+
+  def find_bad(self):
+    """Flags worlds that are not finite."""
+    self._over(_find_bad)
+
+  @functools.cached_property
+  def _xpos(self) -> wp.array:
+    n = len(self.declared.rest)
+    return wp.zeros((self._batch.nworld, n), dtype=wp.vec3, device=self._batch.device)
+
+  @property
+  def xpos(self) -> wp.array:
+    """Places of the nodes [m], (nworld, nnode, 3)."""
+    inputs = [self.fields, self.origin, self._xpos]
+    wp.launch(_show, dim=self._xpos.shape, inputs=inputs, device=self._batch.device)
+    return self._xpos.view(float)
+
+  def pull(self, world: int, data: mujoco.MjData):
+    """Writes its state in a world to an mjData."""
+    organ = self.declared
+    now, speed = (getattr(self.fields, name)[world].numpy() for name in ("now", "speed"))
+    moved = (now - organ.rest)[organ.free].ravel()
+    data.qpos[organ.qposs] = self._batch.model.qpos0[organ.qposs] + moved
+    data.qvel[organ.dofs] = speed[organ.free].ravel()
+    own = self._own(data)
+    own.twist[:], own.force[:] = self.twist[world].numpy(), self.force[world].numpy()
+    own.signature[:] = organ.signature
+
+  def push(self, world: int, data: mujoco.MjData):
+    """Gives a world its state in an mjData."""
+    organ, own = self.declared, self._own(data)
+    for name, at, adr in (("now", data.qpos, organ.qposs), ("speed", data.qvel, organ.dofs)):
+      array = getattr(self.fields, name)
+      row = array[world].numpy()
+      row[organ.free] = at[adr].reshape(-1, 3)
+      if name == "now":
+        row[organ.free] += (organ.rest[organ.free].ravel() - self._batch.model.qpos0[adr]).reshape(-1, 3)
+      array[world].assign(row)
+    self.twist[world].assign(own.twist)
+    self.force[world].assign(own.force)
+
+  def _own(self, data: mujoco.MjData):
+    """Returns views of its part of the plugin state."""
+    start = self._batch.model.plugin_stateadr[self.space.instance]
+    return rods.state_of(data.plugin_state[start:], len(self.declared.rest))
+
+
+class Rods:
+  """The threads of a batch, which may have none."""
+
+  def __init__(self, batch: "Worlds", spaces: list[rods.Workspace]):
+    self.all = {space.organ.name: Thread(batch, space) for space in spaces}
+    self._batch = batch
+    if not spaces:
+      return
+    bare, contact = batch.bare, batch.d.contact
+    self._closed = fill(Closed, batch.device, dict(
+      nthread=len(spaces),
+      paired=int(batch.paired),
+      disableflags=bare.opt.disableflags,
+      discrete=int(bare.opt.integrator == getattr(mujoco.mjtIntegrator, "mjINT_DISCRETE", -1)),
+      timestep=float(bare.opt.timestep),
+      margin=bare.flex_margin[: len(spaces)],
+      nacon=batch.d.nacon,
+      aref=batch.d.efc.aref,
+      **{name: getattr(contact, name) for name in (
+        "dim", "flex", "worldid", "dist", "includemargin", "friction", "solref", "solimp",
+        "efc_address")},
+    ))  # fmt: skip
+
+  def begin(self):
+    """Takes the threads' steps, once there are rows of constraints."""
+    if not self.all:
+      return
+    dim, device = self._closed.dim.shape, self._batch.device
+    wp.launch(_close, dim=dim, inputs=[self._closed], device=device)
+    for each in self.all.values():
+      each.begin()
+
+
+def _rows(kind, name: str, start: np.ndarray, nworld: int, device) -> wp.array:
+  """Returns an array of a field with a row a world."""
+  dtype = kind.vars[name].type.dtype
+  return wp.zeros((nworld, *start.shape), dtype=dtype, device=device)
+
+
+def _stack(values: dict, nworld: int, device) -> wp.array:
+  """Returns a `Rod` for each world: arrays with a row a world are its own, others shared."""
+  each: dict[tuple[str, ...], wp.array] = {}
+
+  def first(kind, values: dict, path: tuple[str, ...]):
+    out = {}
+    for name, var in kind.vars.items():
+      value = values[name]
+      if isinstance(value, dict):
+        value = first(var.type, value, (*path, name))
+      elif isinstance(value, wp.array):
+        each[*path, name] = value
+        value = value[0]
+      out[name] = value
+    return fill(kind, device, out)
+
+  one = first(Rod, values, ())
+  native = one.__ctype__()
+  row = np.frombuffer(bytes(native), np.uint8)
+  rows = np.tile(row, (nworld, 1))
+  for path, array in each.items():
+    kind, offset = type(native), 0
+    for name in path:
+      offset += getattr(kind, name).offset
+      kind = dict(kind._fields_)[name]
+    offset += kind.data.offset
+    address = array.ptr + array.strides[0] * np.arange(nworld, dtype=np.uint64)
+    rows[:, offset : offset + 8] = address.astype(np.uint64)[:, None].view(np.uint8)
+  memory = wp.array(rows, dtype=wp.uint8, device=device)
+  out: Any = wp.array(ptr=memory.ptr, dtype=Rod, shape=nworld, device=device)
+  out.of = memory, one, each
+  return out

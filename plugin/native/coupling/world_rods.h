@@ -1,0 +1,159 @@
+// A rod in many worlds, whose nodes are mujoco_warp's dofs. Its place and velocity are doubles; mujoco_warp has
+// them as floats, and where these are others, as after a reset, they count.
+#pragma once
+#include "coupling/rod.h"
+#include "forces/bodies.h"
+
+AS_WRITTEN
+
+namespace palpate {
+
+template <class Fields>
+struct WorldRod {
+  const Fields& f;  // moved to the world
+  const int world;
+  decltype(*Fields().rods.data) rod;
+
+  PALPATE int own_dof(int dof) const { return f.own_dof.data[dof]; }
+  PALPATE double* solution() const { return f.solution.data; }
+  PALPATE const double* qLD() const { return f.factor.data; }
+  PALPATE const double* qLDiagInv() const { return f.inverse_diagonal.data; }
+
+  PALPATE RowOf<float> row(int r) const {
+    if (!f.sparse) return {f.J.data + (size_t)r * f.J.shape[2], nullptr, f.nv};
+    const int start = f.J_rowadr.data[r];
+    return {f.J.data + start, f.J_colind.data + start, f.J_rownnz.data[r]};
+  }
+  PALPATE double reference(int r) const { return f.aref.data[r]; }
+  PALPATE double stiffness(int r) const { return f.D.data[r]; }
+  PALPATE double last_acceleration(int dof) const { return f.qacc_warmstart.data[dof]; }
+
+  PALPATE bool moves(int i) const { return f.dofadr.data[i] >= 0; }
+  PALPATE D3 inertia(int i) const {
+    const int* at = f.massadr.data + 3 * i;
+    return {f.M.data[at[0]], f.M.data[at[1]], f.M.data[at[2]]};
+  }
+  PALPATE void set_inertia(int i, D3 Mhat) const {
+    const int* at = f.massadr.data + 3 * i;
+    f.M.data[at[0]] = (float)Mhat.x, f.M.data[at[1]] = (float)Mhat.y, f.M.data[at[2]] = (float)Mhat.z;
+  }
+  // The solver starts where the rod's step leads.
+  PALPATE void push(int i, D3 force) const {
+    const int adr = f.dofadr.data[i];
+    float* out = f.qfrc_passive.data + adr;
+    store(out, load(out) + force);
+    const D3 dv = (1.0 / f.timestep) * (load(rod.place.data + 3 * i) - load(rod.start.data + 3 * i)) - load(rod.vel.data + 3 * i);
+    store(f.qacc_warmstart.data + adr, (1.0 / f.timestep) * dv);
+  }
+  PALPATE D3 found(int i) const { return load(f.qfrc_constraint.data + f.dofadr.data[i]); }
+
+  // Where qpos has a place, from rest.
+  PALPATE D3 zero(int i) const { return load(f.qpos0.data + f.qposadr.data[i]) - load(f.rest.data + 3 * i); }
+  PALPATE void move(int i, D3 moved, double h) const {
+    const D3 x = load(rod.start.data + 3 * i) + moved, v = (1.0 / h) * moved;
+    store(f.now.data + 3 * i, x);
+    store(f.speed.data + 3 * i, v);
+    store(f.qpos.data + f.qposadr.data[i], x + zero(i));
+    store(f.qvel.data + f.dofadr.data[i], v);
+  }
+  // What floats have, by the doubles that they are of.
+  PALPATE static D3 exact(const float* told, D3 exact) {
+    const D3 t = load(told);
+    return {(float)exact.x == t.x ? exact.x : t.x, (float)exact.y == t.y ? exact.y : t.y,
+            (float)exact.z == t.z ? exact.z : t.z};
+  }
+
+  // The factors L^T D L of the inertia of other dofs (Featherstone 2008, table 6.3).
+  PALPATE void factor_others() const {
+    double* L = f.factor.data;
+    for (int k = 0; k < (int)f.M.shape[1]; ++k) L[k] = f.M.data[k];
+    for (int k = f.nv - 1; k >= 0; --k) {
+      const int start = f.M_rowadr.data[k], last = f.M_rownnz.data[k] - 1;
+      const double inverse = f.inverse_diagonal.data[k] = 1.0 / L[start + last];
+      for (int c = last - 1; c >= 0; --c) {
+        const double share = L[start + c] * inverse;
+        double* above = L + f.M_rowadr.data[f.M_colind.data[start + c]];
+        for (int b = 0; b <= c; ++b) above[b] -= share * L[start + b];
+        L[start + c] = share;
+      }
+    }
+  }
+
+  // Notes the rows of constraints that act on the rod, those of contacts first.
+  PALPATE void note_rows() const {
+    const int most = (int)f.aref.shape[1], nefc = f.nefc.data[0] < most ? f.nefc.data[0] : most;
+    const int* type = f.type.data;
+    for (int r = 0, count = 1; r < nefc; r += count) {
+      count = 1;
+      if (type[r] < IS_CONTACT) continue;
+      const int c = f.id.data[r], dim = f.contact_dim.data[c];
+      const bool paired = type[r] == CONTACT_PYRAMIDAL;
+      count = paired ? 2 * (dim - 1) : dim;
+      const int* flex = (const int*)f.contact_flex.data + 2 * c;
+      if ((flex[0] != f.flex && flex[1] != f.flex) || r + count > nefc) continue;
+      const float* friction = (const float*)f.contact_friction.data + 5 * c;
+      note_contact(*this, r, count, !paired && count > 1, friction[0] / sqrt(f.impratio), friction);
+    }
+    if (f.joined) factor_others();
+    note_joints(*this, nefc, type, f.id.data);
+  }
+
+  PALPATE void gather(double h) const {
+    const double* R = f.frame.data;
+    const D3 none = {0.0, 0.0, 0.0}, gravity = f.falls ? add_turned(none, R, load((const float*)f.gravity.data)) : none;
+    for (int i = 0; i < rod.nnode; ++i) {
+      const int adr = f.dofadr.data[i];
+      rod.turn.data[i] = 0.0;
+      D3 x = load(f.rest.data + 3 * i), v = none, force = none, last = none, aim = x;
+      if (adr >= 0) {
+        const double m = rod.mass.data[i];
+        x = exact(f.qpos.data + f.qposadr.data[i], load(f.now.data + 3 * i) + zero(i)) - zero(i);
+        v = exact(f.qvel.data + adr, load(f.speed.data + 3 * i));
+        last = load(f.qacc_warmstart.data + adr);
+        const D3 along = m * gravity + load(f.qfrc_applied.data + adr) + load(f.qfrc_passive.data + adr);
+        force = add_turned(along, R, load((const float*)f.xfrc_applied.data + 6 * f.bodyid.data[i]));
+        aim = x + h * v + (h * h / m) * force;
+      }
+      store(rod.start.data + 3 * i, x);
+      store(rod.vel.data + 3 * i, v);
+      store(rod.last.data + 3 * i, last);
+      store(rod.external.data + 3 * i, force);
+      store(rod.aim.data + 3 * i, aim);
+    }
+  }
+};
+
+template <class Fields>
+PALPATE Fields of_world(Fields f, int world) {
+  move_each(world, f.solution, f.factor, f.inverse_diagonal, f.now, f.speed, f.gravity, f.qpos, f.qvel, f.qfrc_applied,
+            f.xfrc_applied, f.qfrc_passive, f.qfrc_constraint, f.qacc_warmstart, f.M, f.nefc, f.type, f.id, f.J,
+            f.J_rownnz, f.J_rowadr, f.J_colind, f.D, f.aref);
+  return f;
+}
+
+template <class Fields>
+PALPATE void begin_rods(const Fields& f, Thread t, int) {
+  if (t.tid > 0) return;
+  const Fields here = of_world(f, t.world);
+  begin(WorldRod<Fields>{here, t.world, f.rods.data[t.world]}, f.timestep);
+}
+
+template <class Fields>
+PALPATE void end_rods(const Fields& f, Thread t, int) {
+  if (t.tid > 0) return;
+  const Fields here = of_world(f, t.world);
+  end(WorldRod<Fields>{here, t.world, f.rods.data[t.world]}, f.timestep);
+}
+
+// Flags the worlds with numbers that are not finite, or huge.
+template <class Fields>
+PALPATE void find_bad_rods(const Fields& f, Thread t, int) {
+  const Fields here = of_world(f, t.world);
+  bool bad = false;
+  each_item(t, 3 * f.rods.data[t.world].nnode, [&](int a) {
+    bad = bad || !(fabs(here.now.data[a]) < 1e6 && fabs(here.speed.data[a]) < 1e6);
+  });
+  if (bad) f.bad.data[t.world] = 1;
+}
+
+}  // namespace palpate
