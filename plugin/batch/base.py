@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.engine import coupling
+from palpate.engine import coupling, rods
 from palpate.engine.model.declare import Declaration
 from palpate.engine.workspace import Workspace
 from palpate.organ import instances
@@ -174,6 +174,22 @@ class Batch(abc.ABC):
       have = ", ".join(map(repr, self.organs)) or "none"
       raise ValueError(f"no organ {name!r} in the batch, it has {have}")
     return self.organs[name]
+
+  @property
+  def threads(self) -> Mapping[str, Thread]:
+    """The threads by name."""
+    raise ValueError("worlds on several devices have their threads in `parts`")
+
+  def thread(self, name: str) -> Thread:
+    """Returns a thread.
+
+    Raises:
+      ValueError: the scene has no thread of that name; the message lists those it has.
+    """
+    if name not in self.threads:
+      have = ", ".join(map(repr, self.threads)) or "none"
+      raise ValueError(f"no thread {name!r} in the batch, it has {have}")
+    return self.threads[name]
 
   # Pictures.
 
@@ -474,6 +490,28 @@ class Tissue(Parting):
     Raises:
       ValueError: a key may not change, or a value is not allowed.
     """
+
+
+class Thread(abc.ABC):
+  """One thread in all worlds of a batch; arrays as those of `Batch`, in world coordinates.
+
+  Attributes:
+    name: name of the flexcomp
+    space: its workspace in one mjData
+  """
+
+  name: str
+  space: rods.Workspace
+
+  @property
+  @abc.abstractmethod
+  def xpos(self) -> wp.array:
+    """Positions of the nodes [m], (nworld, nnode, 3)."""
+
+  @property
+  @abc.abstractmethod
+  def tension(self) -> wp.array:
+    """Tension of each edge [N], (nworld, nnode - 1); negative where it is compressed."""
 
 
 def count_of(nworld: int) -> int:

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.engine import contacts, rods
-from palpate.engine.layout import RodState
+from palpate.engine import rods
 from palpate.engine.rods import Rod
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, doubles, fill, floats, ints, struct
 
+from . import base
 from .contact.contact_rows import parting
 from .private import contact_kbimp, vec5
 
@@ -132,9 +132,7 @@ def _close(f: Closed):
     if f.efc_address[c, r] < 0:
       return
   gap = f.dist[c] - f.includemargin[c]
-  spring = contact_kbimp(
-    f.disableflags, f.timestep, f.solref[c], f.solimp[c], gap, f.discrete == 1
-  )
+  spring = contact_kbimp(f.disableflags, f.timestep, f.solref[c], f.solimp[c], gap, f.discrete == 1)
   world = f.worldid[c]
   off = spring[0] * spring[2] * f.margin[thread]
   off += parting(f.paired, n, c, world, f.friction, f.efc_address, f.aref)
@@ -154,6 +152,18 @@ def _show(f: WorldRods, origin: wp.vec3, out: wp.array2d[wp.vec3]):
   out[w, i] = origin + x
 
 
+@wp.kernel(enable_backward=False)
+def _pull(f: WorldRods, stretch: wp.array[wp.float64], length: wp.array[wp.float64],
+          out: wp.array2d[float]):  # fmt: skip
+  """Writes the tension of edges."""
+  w, i = wp.tid()
+  square = wp.float64(0.0)
+  for c in range(3):
+    edge = f.now[w, i + 1, c] - f.now[w, i, c]
+    square += edge * edge
+  out[w, i] = float(stretch[i] * (wp.sqrt(square) - length[i]))
+
+
 def most_contacts(space: rods.Workspace) -> int:
   """Returns how many contacts with geoms a world has room for."""
   return _EACH * len(space.organ.rest) + _BEYOND
@@ -164,13 +174,8 @@ def bytes_of(space: rods.Workspace) -> float:
   return float(sum(8 * each.size for each in rods.scratch(len(space.organ.rest)).values()))
 
 
-class Thread:
-  """A thread in all worlds of a batch.
-
-  Attributes:
-    name: of its flexcomp
-    xpos: places of its nodes [m], (nworld, nnode, 3)
-  """
+class Thread(base.Thread):
+  """A thread of `Worlds`."""
 
   def __init__(self, batch: "Worlds", space: rods.Workspace):
     organ, bare, device, nworld = space.organ, batch.bare, batch.device, batch.nworld
@@ -189,7 +194,9 @@ class Thread:
     )
     own = {"twist": self.twist, "force": self.force}
     own["signature"] = wp.zeros((nworld, 1), dtype=wp.float64, device=device)
-    each = {name: _rows(Rod, name, start, nworld, device) for name, start in rods.scratch(n).items()}
+    each = {
+      name: _rows(Rod, name, start, nworld, device) for name, start in rods.scratch(n).items()
+    }
     self.iterations = each["status"]
     values: dict[str, Any] = dict(
       rods=_stack(shared | each | {"own": own}, nworld, device),
@@ -222,7 +229,11 @@ class Thread:
       if name not in values:
         values[name] = getattr(d if hasattr(d, name) else d.efc, name)
     self.fields: Any = fill(WorldRods, device, values)
-    self.origin = wp.vec3(*organ.origin)
+    self._origin = wp.vec3(*organ.origin)
+    self._springs = [
+      wp.array(space.constants[name], dtype=wp.float64, device=device)
+      for name in ("stretch", "length")
+    ]
 
   def load(self):
     """Loads the kernels, compiling them where the cache has none."""
@@ -245,17 +256,30 @@ class Thread:
     """Flags worlds that are not finite."""
     self._over(_find_bad)
 
+  def _made(self, kind, count: int) -> wp.array:
+    return wp.zeros((self._batch.nworld, count), dtype=kind, device=self._batch.device)
+
   @functools.cached_property
   def _xpos(self) -> wp.array:
-    n = len(self.declared.rest)
-    return wp.zeros((self._batch.nworld, n), dtype=wp.vec3, device=self._batch.device)
+    return self._made(wp.vec3, len(self.declared.rest))
+
+  @functools.cached_property
+  def _tension(self) -> wp.array:
+    return self._made(float, len(self.declared.rest) - 1)
 
   @property
   def xpos(self) -> wp.array:
-    """Places of the nodes [m], (nworld, nnode, 3)."""
-    inputs = [self.fields, self.origin, self._xpos]
+    """Positions of the nodes [m], (nworld, nnode, 3)."""
+    inputs = [self.fields, self._origin, self._xpos]
     wp.launch(_show, dim=self._xpos.shape, inputs=inputs, device=self._batch.device)
     return self._xpos.view(float)
+
+  @property
+  def tension(self) -> wp.array:
+    """Tension of each edge [N], (nworld, nnode - 1)."""
+    inputs = [self.fields, *self._springs, self._tension]
+    wp.launch(_pull, dim=self._tension.shape, inputs=inputs, device=self._batch.device)
+    return self._tension
 
   def pull(self, world: int, data: mujoco.MjData):
     """Writes its state in a world to an mjData."""
@@ -276,7 +300,7 @@ class Thread:
       row = array[world].numpy()
       row[organ.free] = at[adr].reshape(-1, 3)
       if name == "now":
-        row[organ.free] += (organ.rest[organ.free].ravel() - self._batch.model.qpos0[adr]).reshape(-1, 3)
+        row[organ.free] -= self._batch.model.qpos0[adr].reshape(-1, 3) - organ.rest[organ.free]
       array[world].assign(row)
     self.twist[world].assign(own.twist)
     self.force[world].assign(own.force)

@@ -18,12 +18,14 @@ from palpate.engine import plugin as engine
 from palpate.engine.cutting import cuts as cutting
 from palpate.engine.model.declare import Declaration
 from palpate.organ import Organ, instances
+from palpate.thread import Thread
 from palpate.tissue import body as bodies
 from palpate.tissue.cutting.topology import Report
 from palpate.tissue.device import free_memory, refuse_crowd
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
 
+from . import base
 from .base import Batch, Tissue, spread
 from .bonds import OfThreads
 from .cutting.fracture import Cutters
@@ -66,11 +68,17 @@ class Threads(Batch):
     self._felt: list[tuple[int, str]] = []
     self._seen = np.zeros((nworld, 0, model.nsensordata), np.float32)
     self._organs = {name: _Tissue(self, name, number) for name, number in instances(model).items()}
+    self._threads = {name: _Thread(self, name) for name in instances(model, dim=1)}
 
   @property
   def organs(self) -> dict[str, Tissue]:
     """The organs by name."""
     return dict(self._organs)
+
+  @property
+  def threads(self) -> dict[str, base.Thread]:
+    """The threads by name."""
+    return dict(self._threads)
 
   def each(self, work: Callable[[int], object], worlds=None):
     """Does work(world) for all worlds, or some, on the threads."""
@@ -299,6 +307,26 @@ class _Tissue(Tissue):
   def _rub(self, world: int, friction: float):
     organ = self.spaces[world].organ
     self.batch.models[world].flex_friction[organ.flexes, 0] = friction
+
+
+class _Thread(base.Thread):
+  """A thread of `Threads`."""
+
+  def __init__(self, batch: Threads, name: str):
+    pairs = zip(batch.models, batch.datas, strict=True)
+    self.name, self.handles = name, [Thread(model, data, name) for model, data in pairs]
+    number = instances(batch.model, dim=1)[name]
+    self.space = engine.find_thread(batch.datas[0]._address, number)
+
+  @property
+  def xpos(self) -> wp.array:
+    """Positions of the nodes [m], (nworld, nnode, 3)."""
+    return wp.array([each.positions for each in self.handles], dtype=float, device="cpu")
+
+  @property
+  def tension(self) -> wp.array:
+    """Tension of each edge [N], (nworld, nnode - 1)."""
+    return wp.array([each.tension for each in self.handles], dtype=float, device="cpu")
 
 
 def _threads(nthread: int | None) -> int:

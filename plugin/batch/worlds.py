@@ -78,9 +78,7 @@ class Worlds(Batch):
       (strip_organs.nodes_under(model, o, t) > n).any()
       for o, t, n in zip(declared, tools, nslots, strict=True)
     )
-    bare, slots = strip_organs.strip(
-      spec, model, declared, nslots, [w.organ for w in sewn]
-    )
+    bare, slots = strip_organs.strip(spec, model, declared, nslots, [w.organ for w in sewn])
     self._kept, self.bare = strip_organs.kept(model, declared), bare
     self._graphs: dict[str, tuple[Any, Any]] = {}
     with wp.ScopedDevice(target):
@@ -163,7 +161,7 @@ class Worlds(Batch):
     self._order = FixedOrder(self.m, self.d) if ordered else None
     sorted_by_warp = deterministic and not ordered
     self.m.opt.deterministic = int(DeterminismType.ALL if sorted_by_warp else DeterminismType.NONE)
-    # The windows' triangles have no forces and contacts of mujoco_warp's own, threads contacts alone.
+    # The windows' triangles have no forces and contacts of mujoco_warp's own, threads no forces.
     self.m.nflexedge, self.m.nflexelem = 0, sum(len(w.organ.rest) - 1 for w in sewn)
     self.m.nflex = len(sewn) or self.m.nflex
     gravity = np.tile(model.opt.gravity, (nworld, 1)).astype(np.float32)
@@ -350,6 +348,11 @@ class Worlds(Batch):
   def organs(self) -> dict[str, Organ]:
     """The organs by name."""
     return dict(self._organs)
+
+  @property
+  def threads(self) -> dict[str, rods.Thread]:
+    """The threads by name."""
+    return dict(self.rods.all)
 
   @property
   def kept(self) -> tuple[np.ndarray, np.ndarray]:

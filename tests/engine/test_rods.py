@@ -35,10 +35,14 @@ def document(points, *, pin=(), h=1e-3, world="", after="", option="", contact="
     </worldbody>{after}</mujoco>"""
 
 
-def load(*args, **kwargs):
-  model = mujoco.MjModel.from_xml_string(document(*args, **kwargs))
+def loaded(text):
+  model = mujoco.MjModel.from_xml_string(text)
   data = mujoco.MjData(model)
   return model, data, palpate.Thread(model, data, "t")
+
+
+def load(*args, **kwargs):
+  return loaded(document(*args, **kwargs))
 
 
 def run(model, data, steps):
@@ -159,23 +163,28 @@ def test_a_sudden_pull_of_a_newton_is_borne(h):
 # Contacts are MuJoCo's.
 
 
-def capstan(friction, cone, kind="cylinder", h=1e-3):
-  """Returns a thread half around a drum, its left end loaded, its right end on a slide."""
-  drum, tail, n = 0.01, 0.03, 81
-  r = drum + RADIUS
+def drum(friction, cone, kind="cylinder", h=1e-3):
+  """Returns a thread half around a drum, its left end to be loaded, its right end on a slide."""
+  radius, tail, n = 0.01, 0.03, 81
+  r = radius + RADIUS
   s = np.linspace(0, np.pi * r + 2 * tail, n)
   angle = np.clip(np.pi - (s - tail) / r, 0, np.pi)
   below = np.maximum(tail - s, 0) + np.maximum(s - tail - np.pi * r, 0)
   points = np.stack([r * np.cos(angle), 0 * s, r * np.sin(angle) - below], axis=1)
   x, _, z = points[-1]
-  world = f"""<geom type="{kind}" size="{drum} .02" euler="90 0 0" friction="{friction} 0 0"/>
+  world = f"""<geom type="{kind}" size="{radius} .02" euler="90 0 0" friction="{friction} 0 0"/>
     <body name="puller" pos="{x} 0 {z}"><joint name="pull" type="slide" axis="0 0 -1"/>
     <geom size=".002" mass=".1" contype="0" conaffinity="0"/></body>"""
   after = f"""<equality><connect body1="puller" body2="t_{n - 1}" anchor="0 0 0" solref=".002 1"/>
     </equality><actuator><velocity joint="pull" kv="100"/></actuator>"""
   contact = f'friction="{friction} 0 0" condim="3"'
   option = f'cone="{cone}" {FREE}'
-  return load(points, world=world, after=after, contact=contact, option=option, bend=0.01, h=h)
+  keys = dict(world=world, after=after, contact=contact, option=option, bend=0.01, h=h)
+  return document(points, **keys)
+
+
+def capstan(*args, **kwargs):
+  return loaded(drum(*args, **kwargs))
 
 
 @pytest.mark.parametrize(
@@ -195,15 +204,19 @@ def test_a_thread_around_a_drum_obeys_the_capstan_law(friction, cone, kind):
   assert tension[-1] / tension[0] == pytest.approx(np.exp(friction * np.pi), rel=0.03)
 
 
-@pytest.mark.parametrize("mass", [1e-4, 2e-2])
-def test_a_needle_swings_on_its_thread(mass):
-  """Let go from beside the point that it hangs on; a node weighs 0.2 mg."""
-  n = 41
+def needle(mass, n=41):
+  """Returns a needle on the end of a thread, beside the point that it hangs on."""
   world = f"""<body name="needle" pos=".08 0 0"><freejoint/><geom type="capsule" size=".0004"
     fromto="0 0 0 .012 0 0" mass="{mass}" contype="0" conaffinity="0"/></body>"""
   after = f"""<equality><connect body1="needle" body2="t_{n - 1}" anchor="0 0 0" solref=".002 1"/>
     </equality>"""
-  model, data, thread = load(line(n, 0.08), pin=(0,), world=world, after=after, bend=0.02)
+  return document(line(n, 0.08), pin=(0,), world=world, after=after, bend=0.02)
+
+
+@pytest.mark.parametrize("mass", [1e-4, 2e-2])
+def test_a_needle_swings_on_its_thread(mass):
+  """A node weighs 0.2 mg."""
+  model, data, thread = loaded(needle(mass))
   weight, most, low = 9.81 * (mass + MASS), 0.0, 0.0
   for _ in range(400):
     run(model, data, 1)
@@ -331,12 +344,6 @@ def test_bad_threads_are_named(kwargs, message):
     text = text.replace('selfcollide="none" ', "")
   with pytest.raises(ValueError, match=message):
     mujoco.MjModel.from_xml_string(text)
-
-
-def test_a_batch_on_a_gpu_refuses_threads():
-  spec = mujoco.MjSpec.from_string(document(line(5, 0.01)))
-  with pytest.raises(ValueError, match="the scene has thread 't', expected none"):
-    batch.make(spec, 2, "warp-cpu")
 
 
 def test_threads_are_stepped_in_batches_on_the_cpu():

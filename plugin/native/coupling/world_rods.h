@@ -143,6 +143,7 @@ PALPATE void end_rods(const Fields& f, Thread t, int) {
   if (t.tid > 0) return;
   const Fields here = of_world(f, t.world);
   end(WorldRod<Fields>{here, t.world, f.rods.data[t.world]}, f.timestep);
+  if (f.rods.data[t.world].status.data[0] < 0) f.bad.data[t.world] = 1;
 }
 
 // Flags the worlds with numbers that are not finite, or huge.
