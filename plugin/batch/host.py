@@ -136,14 +136,14 @@ def bodies_of(batch: Worlds) -> Any:
   d, model, values = batch.d, batch.bare, {}
   for name in WorldBodies.vars:
     if hasattr(d, name):
-      values[name] = _rows(getattr(d, name))
+      values[name] = float_rows(getattr(d, name))
     else:
       source = model.opt if hasattr(model.opt, name) else model
       values[name] = np.asarray(getattr(source, name)).reshape(-1, *DIMS["WorldBodies"][name][1:])
   return fill(WorldBodies, batch.device, values)
 
 
-def _rows(array: Any) -> Any:
+def float_rows(array: Any) -> Any:
   """Returns an array of mujoco_warp's as floats, a row a world, in its memory."""
   item = wp.types.type_size_in_bytes(array.dtype) // 4
   count = int(np.prod(array.shape[1:])) * item

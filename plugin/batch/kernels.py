@@ -225,6 +225,34 @@ def show(p: Patch, what: int, out: wp.array2d[wp.vec3]):
 
 
 @wp.kernel(enable_backward=False)
+def show_rod(
+  now: wp.array3d[wp.float64], frame: wp.array2d[wp.float64], origin: wp.vec3,
+  out: wp.array2d[wp.vec3],
+):  # fmt: skip
+  """Writes where a thread's nodes are in the world."""
+  w, i = wp.tid()
+  x = wp.vec3()
+  for a in range(3):
+    for c in range(3):
+      x[a] += float(frame[a, c] * now[w, i, c])
+  out[w, i] = origin + x
+
+
+@wp.kernel(enable_backward=False)
+def pull_rod(
+  now: wp.array3d[wp.float64], stretch: wp.array[wp.float64], length: wp.array[wp.float64],
+  out: wp.array2d[float],
+):  # fmt: skip
+  """Writes the tension of a thread's edges."""
+  w, i = wp.tid()
+  square = wp.float64(0.0)
+  for c in range(3):
+    edge = now[w, i + 1, c] - now[w, i, c]
+    square += edge * edge
+  out[w, i] = float(stretch[i] * (wp.sqrt(square) - length[i]))
+
+
+@wp.kernel(enable_backward=False)
 def put_back_rows(mask: wp.array[bool], start: wp.array2d[Any], out: wp.array2d[Any]):
   """Puts rows of the worlds of a mask back to where they start."""
   w, k = wp.tid()

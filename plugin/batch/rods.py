@@ -17,9 +17,9 @@ from palpate.engine.rods import Rod
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, doubles, fill, floats, ints, struct
 
-from . import base
-from .contact.contact_rows import parting
-from .private import contact_kbimp, vec5
+from . import base, host, kernels
+from .contact.contact_rows import Early, take_early
+from .private import vec5
 
 if TYPE_CHECKING:
   from .worlds import Worlds
@@ -65,7 +65,7 @@ class WorldRods:
   qpos: floats("nworld", "nq")
   qvel: floats("nworld", "nv")
   qfrc_applied: floats("nworld", "nv")
-  xfrc_applied: Array(wp.spatial_vector, ("nworld", "nbody"))
+  xfrc_applied: floats("nworld", "nbody6")
   qfrc_passive: floats("nworld", "nv")
   qfrc_constraint: floats("nworld", "nv")
   qacc_warmstart: floats("nworld", "nv")
@@ -90,78 +90,6 @@ _begin, _end, _find_bad = (
   kernel(name, "coupling/world_rods.h", WorldRods, _CONSTANTS)
   for name in ("begin_rods", "end_rods", "find_bad_rods")
 )
-
-
-@struct
-class Closed:
-  """Contacts of threads in mujoco_warp's arrays, which are there before they touch."""
-
-  nthread: int  # flexes that are threads, the first ones
-  paired: int  # whether the cone is a pyramid
-  disableflags: int  # of mjOption
-  discrete: int  # whether the integrator is
-  timestep: float  # [s]
-  margin: floats("nthread")  # of each thread [m]
-  nacon: ints(1)
-  dim: ints("naconmax")
-  flex: Array(wp.vec2i, ("naconmax",))
-  worldid: ints("naconmax")
-  dist: floats("naconmax")
-  includemargin: floats("naconmax")
-  friction: Array(vec5, ("naconmax",))
-  solref: Array(wp.vec2, ("naconmax",))
-  solimp: Array(vec5, ("naconmax",))
-  efc_address: ints("naconmax", "nrow")
-  aref: floats("nworld", "njmax")
-
-
-@wp.kernel(enable_backward=False)
-def _close(f: Closed):
-  """Takes margin and parting off the gaps of threads' contacts, see `keep_closed`."""
-  c = wp.tid()
-  if c >= f.nacon[0]:
-    return
-  thread = wp.max(f.flex[c][0], f.flex[c][1])
-  if thread >= f.nthread:
-    thread = wp.min(f.flex[c][0], f.flex[c][1])
-  if thread < 0 or thread >= f.nthread:
-    return
-  n = f.dim[c]
-  rows = wp.where(f.paired == 1 and n > 1, 2 * (n - 1), n)
-  for r in range(rows):
-    if f.efc_address[c, r] < 0:
-      return
-  gap = f.dist[c] - f.includemargin[c]
-  spring = contact_kbimp(f.disableflags, f.timestep, f.solref[c], f.solimp[c], gap, f.discrete == 1)
-  world = f.worldid[c]
-  off = spring[0] * spring[2] * f.margin[thread]
-  off += parting(f.paired, n, c, world, f.friction, f.efc_address, f.aref)
-  for r in range(wp.where(f.paired == 1, rows, 1)):
-    row = f.efc_address[c, r]
-    f.aref[world, row] = f.aref[world, row] - off
-
-
-@wp.kernel(enable_backward=False)
-def _show(f: WorldRods, origin: wp.vec3, out: wp.array2d[wp.vec3]):
-  """Writes where nodes are in the world."""
-  w, i = wp.tid()
-  x = wp.vec3()
-  for a in range(3):
-    for c in range(3):
-      x[a] += float(f.frame[a, c] * f.now[w, i, c])
-  out[w, i] = origin + x
-
-
-@wp.kernel(enable_backward=False)
-def _pull(f: WorldRods, stretch: wp.array[wp.float64], length: wp.array[wp.float64],
-          out: wp.array2d[float]):  # fmt: skip
-  """Writes the tension of edges."""
-  w, i = wp.tid()
-  square = wp.float64(0.0)
-  for c in range(3):
-    edge = f.now[w, i + 1, c] - f.now[w, i, c]
-    square += edge * edge
-  out[w, i] = float(stretch[i] * (wp.sqrt(square) - length[i]))
 
 
 def most_contacts(space: rods.Workspace) -> int:
@@ -222,6 +150,7 @@ class Thread(base.Thread):
       solution=np.zeros((nworld, bare.nv)),
       bad=batch.bad,
       gravity=m.opt.gravity,
+      xfrc_applied=host.float_rows(d.xfrc_applied),
       **{name: getattr(bare, name) for name in ("M_rowadr", "M_rownnz", "M_colind")},
       **{f"contact_{name}": getattr(d.contact, name) for name in ("dim", "flex", "friction")},
     )
@@ -270,15 +199,15 @@ class Thread(base.Thread):
   @property
   def xpos(self) -> wp.array:
     """Positions of the nodes [m], (nworld, nnode, 3)."""
-    inputs = [self.fields, self._origin, self._xpos]
-    wp.launch(_show, dim=self._xpos.shape, inputs=inputs, device=self._batch.device)
+    inputs = [self.fields.now, self.fields.frame, self._origin, self._xpos]
+    wp.launch(kernels.show_rod, dim=self._xpos.shape, inputs=inputs, device=self._batch.device)
     return self._xpos.view(float)
 
   @property
   def tension(self) -> wp.array:
     """Tension of each edge [N], (nworld, nnode - 1)."""
-    inputs = [self.fields, *self._springs, self._tension]
-    wp.launch(_pull, dim=self._tension.shape, inputs=inputs, device=self._batch.device)
+    inputs = [self.fields.now, *self._springs, self._tension]
+    wp.launch(kernels.pull_rod, dim=self._tension.shape, inputs=inputs, device=self._batch.device)
     return self._tension
 
   def pull(self, world: int, data: mujoco.MjData):
@@ -320,7 +249,7 @@ class Rods:
     if not spaces:
       return
     bare, contact = batch.bare, batch.d.contact
-    self._closed = fill(Closed, batch.device, dict(
+    self._early = fill(Early, batch.device, dict(
       nthread=len(spaces),
       paired=int(batch.paired),
       disableflags=bare.opt.disableflags,
@@ -338,8 +267,8 @@ class Rods:
     """Takes the threads' steps, once there are rows of constraints."""
     if not self.all:
       return
-    dim, device = self._closed.dim.shape, self._batch.device
-    wp.launch(_close, dim=dim, inputs=[self._closed], device=device)
+    dim, device = self._early.dim.shape, self._batch.device
+    wp.launch(take_early, dim=dim, inputs=[self._early], device=device)
     for each in self.all.values():
       each.begin()
 
@@ -376,8 +305,10 @@ def _stack(values: dict, nworld: int, device) -> wp.array:
       offset += getattr(kind, name).offset
       kind = dict(kind._fields_)[name]
     offset += kind.data.offset
-    address = array.ptr + array.strides[0] * np.arange(nworld, dtype=np.uint64)
-    rows[:, offset : offset + 8] = address.astype(np.uint64)[:, None].view(np.uint8)
+    address: Any = array.ptr
+    stride: Any = array.strides
+    each_address = address + stride[0] * np.arange(nworld, dtype=np.uint64)
+    rows[:, offset : offset + 8] = each_address[:, None].view(np.uint8)
   memory = wp.array(rows, dtype=wp.uint8, device=device)
   out: Any = wp.array(ptr=memory.ptr, dtype=Rod, shape=nworld, device=device)
   out.of = memory, one, each

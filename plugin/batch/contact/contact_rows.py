@@ -219,6 +219,55 @@ def press(p: Pressed):
   p.pressed[world, k] = total
 
 
+@struct
+class Early:
+  """Contacts of threads in mujoco_warp's arrays, which are there before they touch."""
+
+  nthread: int  # flexes that are threads, the first ones
+  paired: int  # whether the cone is a pyramid
+  disableflags: int  # of mjOption
+  discrete: int  # whether the integrator is
+  timestep: float  # [s]
+  margin: floats("nthread")  # of each thread [m]
+  nacon: ints(1)
+  dim: ints("naconmax")
+  flex: Array(wp.vec2i, ("naconmax",))
+  worldid: ints("naconmax")
+  dist: floats("naconmax")
+  includemargin: floats("naconmax")
+  friction: Array(vec5, ("naconmax",))
+  solref: Array(wp.vec2, ("naconmax",))
+  solimp: Array(vec5, ("naconmax",))
+  efc_address: ints("naconmax", "nrow")
+  aref: floats("nworld", "njmax")
+
+
+@wp.kernel(enable_backward=False)
+def take_early(f: Early):
+  """Takes margin and parting off the gaps of threads' contacts, see `keep_closed`."""
+  c = wp.tid()
+  if c >= f.nacon[0]:
+    return
+  thread = wp.max(f.flex[c][0], f.flex[c][1])
+  if thread >= f.nthread:
+    thread = wp.min(f.flex[c][0], f.flex[c][1])
+  if thread < 0 or thread >= f.nthread:
+    return
+  n = f.dim[c]
+  rows = wp.where(f.paired == 1 and n > 1, 2 * (n - 1), n)
+  for r in range(rows):
+    if f.efc_address[c, r] < 0:
+      return
+  gap = f.dist[c] - f.includemargin[c]
+  spring = contact_kbimp(f.disableflags, f.timestep, f.solref[c], f.solimp[c], gap, f.discrete == 1)
+  world = f.worldid[c]
+  off = spring[0] * spring[2] * f.margin[thread]
+  off += parting(f.paired, n, c, world, f.friction, f.efc_address, f.aref)
+  for r in range(wp.where(f.paired == 1, rows, 1)):
+    row = f.efc_address[c, r]
+    f.aref[world, row] = f.aref[world, row] - off
+
+
 def make(organ: "Organ", model: mujoco.MjModel, touch):
   """Returns the contacts of an organ.
 
