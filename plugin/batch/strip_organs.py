@@ -94,6 +94,18 @@ def slots_for(model, organ: Declaration, tools: np.ndarray, nodes) -> int:
   return int(min(np.clip(math.ceil(many), 8, _USUAL), nvert))
 
 
+def check_apart(model, organs: list, threads: list):
+  """Raises ValueError where an organ and a thread may touch."""
+  kind, meets = model.flex_contype, model.flex_conaffinity
+  for organ, thread in itertools.product(organs, threads):
+    a, b = organ.windows.flex if organ.windows else organ.flex, thread.flex
+    if kind[a] & meets[b] or kind[b] & meets[a]:
+      raise ValueError(
+        f"organ {organ.name!r} and thread {thread.name!r} may touch, which a batch on a GPU cannot "
+        "do; expected contype and conaffinity that keep them apart"
+      )
+
+
 def _kind(kind: int) -> str:
   return mujoco.mjtGeom(int(kind)).name.removeprefix("mjGEOM_").lower()
 

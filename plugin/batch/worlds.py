@@ -70,6 +70,7 @@ class Worlds(Batch):
       for number in instances(model, dim=1).values()
     ]
     host.check(spaces.values())
+    strip_organs.check_apart(model, declared, [w.organ for w in sewn])
     tools = [strip_organs.tools_of(model, organ) for organ in declared]
     nslots = [
       strip_organs.slots_for(model, o, t, nodes) for o, t in zip(declared, tools, strict=True)

@@ -91,8 +91,12 @@ def shapes():
   """Returns `SHAPES` with a block of tissue in it."""
   spec, made = mj.MjSpec.from_string(SHAPES), block()
   palpate.add_organ(
-    spec, (np.array(made.vertices), np.array(made.faces)), pos=[0.1, -0.2, 0.3], mass=0.06,
-    young=1e4, rgba=(0.8, 0.3, 0.3, 1),
+    spec,
+    (np.array(made.vertices), np.array(made.faces)),
+    pos=[0.1, -0.2, 0.3],
+    mass=0.06,
+    young=1e4,
+    rgba=(0.8, 0.3, 0.3, 1),
   )
   return spec
 

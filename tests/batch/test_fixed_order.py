@@ -88,9 +88,7 @@ def test_runs_repeat_to_the_bit(device):
 
 
 def test_what_is_not_known_is_left_to_warp():
-  batch = palpate.batch.make(
-    mujoco.MjSpec.from_string(probed()), 1, "warp-cpu", deterministic=True
-  )
+  batch = palpate.batch.make(mujoco.MjSpec.from_string(probed()), 1, "warp-cpu", deterministic=True)
   assert is_enough(batch.m, batch.bare)
   batch.bare.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
   assert not is_enough(batch.m, batch.bare)
