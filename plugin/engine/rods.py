@@ -31,7 +31,7 @@ _MOST_ROWS = 48  # of MuJoCo's constraints, for one node
 CORE, NEIGHBOURS = 0.5, 3.5
 _MOST_PAIRS = 32  # of edges near each other, for one node
 _SOFT = 0.05  # modulus across a thread over that along it, an estimate
-_SLOW = 1e-4  # velocity below which friction within a thread is viscous [m/s]
+_SLOW = 1e-6  # velocity below which friction within a thread is viscous [m/s]
 _MUJOCOS = (
   *("jacobian", "flex_margin", "qvel", "qacc_warmstart"),
   *("M_rowadr", "M_rownnz", "M_colind"),
@@ -56,6 +56,7 @@ class Rod:
   friction: float  # of the thread on itself
   slow: float  # velocity below which friction is viscous [m/s]
   length: doubles("nnode")  # rest length of an edge [m]
+  along: doubles("nnode")  # rest length up to a node [m]
   stretch: doubles("nnode")  # E A / length of an edge [N/m]
   bend: doubles("nnode")  # E I over the length of a node [N m]
   torsion: doubles("nnode")  # G J over the length of a node [N m]
@@ -76,16 +77,20 @@ class Rod:
   gradient: doubles("nunknown")  # of what a step makes least
   matrix: doubles("nentry")  # its second derivative, and the factors of that, see `Envelope`
   inverse: doubles("nentry")  # of the matrix without constraints, there
+  rank: ints("nnode")  # of a node in the matrix
+  near: ints("nnode + 1", "nword_node")  # a bit for each two nodes that are neighbours in the matrix
+  ranked: doubles("nunknown")  # scratch
   first: ints("nunknown")  # first column of each row
   start_of_row: ints("nunknown")  # where it is
   below: ints("nunknown")  # scratch
   status: ints(1)  # iterations, or -1: not finite
   count: ints(3)  # rows of constraints that act on the rod; pairs of edges listed; entries
+  smooth: doubles(1)  # velocity below which friction is viscous in this step [m/s]
   reach: doubles(1)  # how far these may be apart before they touch [m]
   listed: doubles("nnode", 3)  # place where these were listed [m]
   pair: ints("npair", 2)  # the two edges
   pressure: doubles("npair")  # force between them as the step begins [N]
-  touch: doubles("npair", 5)  # where it acts on each, as weights, and the normal
+  touch: doubles("npair", 5)  # where and how it acts, see `TOUCH`
   row_kind: ints("nrow")  # see `RowKind`
   row_node: ints("nrow")  # the first of the two nodes
   row_value: doubles("nrow", 9)  # J of their dofs; J a of other bodies less aref; D; friction
@@ -227,16 +232,19 @@ def settings(organ: Declaration, friction: float) -> dict:
 def scratch(n: int) -> dict[str, np.ndarray]:
   """Returns the fields of `Rod` that a step of n nodes writes."""
   nodes = ("start", "vel", "last", "external", "aim", "place", "listed")
-  unknowns = ("force", "move", "trial", "gradient", "first", "start_of_row", "below")
+  unknowns = ("force", "move", "trial", "ranked", "gradient", "first", "start_of_row", "below")
   pairs, rows, entries = _MOST_PAIRS * n, _MOST_ROWS * n, 2 * n * (4 * n + 1)
   return dict(
     **{name: np.zeros((n, 3)) for name in nodes},
     **{name: np.zeros(4 * n) for name in unknowns},
     turn=np.zeros(n),
+    rank=np.zeros(n),
+    near=np.zeros(((n + 1), -(-n // 32))),
     matrix=np.zeros(entries),
     inverse=np.zeros(entries),
     status=np.zeros(1),
     count=np.zeros(3),
+    smooth=np.zeros(1),
     reach=np.zeros(1),
     pair=np.zeros((pairs, 2)),
     pressure=np.zeros(pairs),

@@ -106,6 +106,7 @@ def constants(
     "shortest": float(length.min()),
     "longest": float(length.max()),
     "length": np.append(length, 0.0),
+    "along": np.append(0.0, np.cumsum(length)),
     "stretch": np.append(young * area / length, 0.0),
     "bend": bend,
     "torsion": torsion,

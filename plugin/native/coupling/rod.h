@@ -138,7 +138,7 @@ PALPATE void note_joints(const Host& host, int nefc, const int* type, const int*
 
 template <class Rod>
 PALPATE Envelope inverse_of(const Rod& rod) {
-  return {rod.inverse.data, rod.first.data, rod.start_of_row.data, 4 * rod.nnode};
+  return {rod.inverse.data, rod.first.data, rod.start_of_row.data, matrix_of(rod).n};
 }
 
 // An inertia of a node alone in the rod's step that is no more than in any direction, and no less than a third of
@@ -146,7 +146,10 @@ PALPATE Envelope inverse_of(const Rod& rod) {
 template <class Rod>
 PALPATE double alone(const Rod& rod, int i, double h) {
   double trace = 0.0;
-  for (int c = 0; c < 3; ++c) trace += inverse_of(rod).at(4 * i + c, 4 * i + c);
+  for (int c = 0; c < 3; ++c) {
+    const int a = matrix_of(rod).of(i, c);
+    trace += inverse_of(rod).at(a, a);
+  }
   const double found = h * h / trace, mass = rod.mass.data[i];
   return found > mass ? found : mass;
 }
@@ -164,10 +167,11 @@ PALPATE void begin(const Host& host, double h) {
   if (!ok)  // holds still for this step instead of spreading the damage
     for (int a = 0; a < 3 * rod.nnode; ++a) rod.place.data[a] = rod.start.data[a];
   if (touched) {
-    const Envelope H = matrix_of(rod);
+    const RodMatrix H = matrix_of(rod);
+    lay_out(rod, rod.place.data);
     for (int a = 0; a < n; ++a) rod.force.data[a] = 0.0;
     rows_cost(rod, rod.place.data, h, rod.force.data, &H);
-    assemble(rod, rod.place.data, rod.turn.data, h, rod.gradient.data);
+    assemble(rod, rod.place.data, rod.turn.data, h, rod.gradient.data, false);
     hold(rod, rod.gradient.data, H);
     factorize(H, rod.trial.data);
     invert_there(H, inverse_of(rod), rod.below.data);
@@ -196,7 +200,7 @@ PALPATE void end(const Host& host, double h) {
       store(rod.move.data + 4 * i, host.moves(i) ? found + load(rod.force.data + 4 * i) : found);
       rod.move.data[4 * i + 3] = 0.0;
     }
-    solve_factorized(matrix_of(rod), rod.move.data);
+    solve_nodes(rod, rod.move.data);
     const double part = safe_part(rod, rod.place.data, rod.move.data, 4);
     for (int i = 0; i < rod.nnode; ++i) {
       store(rod.place.data + 3 * i, load(rod.place.data + 3 * i) + part * load(rod.move.data + 4 * i));

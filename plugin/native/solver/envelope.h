@@ -19,23 +19,34 @@ struct Envelope {
   PALPATE double& at(int i, int j) const { return i >= j ? row(i)[j] : row(j)[i]; }
 };
 
+#if ON_CUDA
+struct V4 {
+  double x, y, z, w;
+};
+PALPATE V4 ld4(const double* p) { return {p[0], p[1], p[2], p[3]}; }
+PALPATE void add_product(V4& s, V4 a, V4 b) {
+  s.x += a.x * b.x, s.y += a.y * b.y, s.z += a.z * b.z, s.w += a.w * b.w;
+}
+#else
+typedef double V4 __attribute__((ext_vector_type(4), aligned(8)));
+PALPATE V4 ld4(const double* p) { return *(const V4*)p; }
+PALPATE void add_product(V4& s, V4 a, V4 b) { s += a * b; }
+#endif
+PALPATE double sum_of(V4 s) { return (s.x + s.y) + (s.z + s.w); }
+
 // Sum of products, in an order that does not depend on the compiler.
 PALPATE double dot_of(const double* a, const double* b, int n) {
-  double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
+  V4 s = {0.0, 0.0, 0.0, 0.0};
   int k = 0;
-  for (; k + 4 <= n; k += 4) {
-    s0 += a[k] * b[k];
-    s1 += a[k + 1] * b[k + 1];
-    s2 += a[k + 2] * b[k + 2];
-    s3 += a[k + 3] * b[k + 3];
-  }
-  for (; k < n; ++k) s0 += a[k] * b[k];
-  return (s0 + s1) + (s2 + s3);
+  for (; k + 4 <= n; k += 4) add_product(s, ld4(a + k), ld4(b + k));
+  double rest = 0.0;
+  for (; k < n; ++k) rest += a[k] * b[k];
+  return sum_of(s) + rest;
 }
 
 // L D L^T = A in place of A: the unit lower triangle L, and on its diagonal 1 / D. `u` is scratch, n long.
-// Pivots of a matrix that is not positive definite are replaced, so that the solution is finite.
-PALPATE void factorize(const Envelope& A, double* u) {
+// Returns whether A is positive definite, and stops where it is not.
+PALPATE bool factorize(const Envelope& A, double* u) {
   for (int i = 0; i < A.n; ++i) {
     const int lo = A.first[i];
     double* row = A.row(i);
@@ -43,13 +54,16 @@ PALPATE void factorize(const Envelope& A, double* u) {
       const int from = A.first[j] > lo ? A.first[j] : lo;
       u[j] = row[j] - dot_of(u + from, A.row(j) + from, j - from);
     }
+    const double least = 1e-12 * row[i];
     double pivot = row[i];
     for (int j = lo; j < i; ++j) {
       row[j] = u[j] * A.row(j)[j];
       pivot -= row[j] * u[j];
     }
-    row[i] = 1.0 / (pivot > 1e-300 ? pivot : 1e300);
+    if (!(pivot > least)) return false;
+    row[i] = 1.0 / pivot;
   }
+  return true;
 }
 
 // A^-1 b in place of b, from the factors.
@@ -67,18 +81,21 @@ PALPATE void solve_factorized(const Envelope& L, double* b) {
 
 // The entries of A^-1 there, from the factors (Erisman and Tinney 1975, doi:10.1145/360680.360704).
 PALPATE void invert_there(const Envelope& L, const Envelope& Z, int* below) {
+  int count = 0;  // rows after i that have column i, the last one first
   for (int i = L.n - 1; i >= 0; --i) {
-    int count = 0;  // rows whose envelope has column i
-    for (int k = i + 1; k < L.n; ++k)
-      if (L.first[k] <= i) below[count++] = k;
-    for (int a = count - 1; a >= 0; --a) {
-      double sum = 0.0;
-      for (int b = 0; b < count; ++b) sum -= L.row(below[b])[i] * Z.at(below[a], below[b]);
-      Z.at(below[a], i) = sum;
-    }
+    int kept = 0;
+    for (int k = 0; k < count; ++k)
+      if (L.first[below[k]] <= i) below[kept++] = below[k];
+    count = kept;
     double sum = L.row(i)[i];
-    for (int b = 0; b < count; ++b) sum -= L.row(below[b])[i] * Z.at(below[b], i);
+    for (int a = 0; a < count; ++a) {
+      double entry = 0.0;
+      for (int b = 0; b < count; ++b) entry -= L.row(below[b])[i] * Z.at(below[a], below[b]);
+      Z.at(below[a], i) = entry;
+      sum -= L.row(below[a])[i] * entry;
+    }
     Z.at(i, i) = sum;
+    below[count++] = i;
   }
 }
 

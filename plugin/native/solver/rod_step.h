@@ -13,8 +13,8 @@ AS_WRITTEN
 namespace palpate {
 
 constexpr int DOFS = 6;  // of the two nodes that a row reaches
-// Newton's method ends when no node moves by more than this share of the shortest edge.
-constexpr double CLOSE = 1e-6;
+// Newton's method ends when no node moves by more than this share of the radius.
+constexpr double CLOSE = 1e-5;
 constexpr double SLOPE = 1e-4;  // of a step's decrease, the least (Armijo)
 constexpr int HALVINGS = 30;
 
@@ -47,16 +47,18 @@ struct RodRow {
 
 // Adds force J to a gradient by place, and stiffness J J^T to the matrix.
 template <class Fields>
-PALPATE void add_row(const Fields&, int node, const double* J, double force, double stiffness, double* g, const Envelope* H) {
-  const double v[7] = {J[0], J[1], J[2], 0.0, J[3], J[4], J[5]};
-  const int n = J[3] == 0.0 && J[4] == 0.0 && J[5] == 0.0 ? 3 : 7;
-  add_term(g, *H, 4 * node, v, n, force, stiffness);
+PALPATE void add_row(const Fields& f, int node, const double* J, double force, double stiffness, double* g, const RodMatrix* H) {
+  Terms<2> terms;
+  terms.add(J, force, stiffness);
+  const int last = node + 1 < f.nnode ? node + 1 : node - 1;  // at the end, of which there is nothing
+  const int nodes[2] = {node, last};
+  terms.scatter(nodes, g, *H);
 }
 
 // The cost of a cone (MuJoCo, Computation, elliptic cones) whose first row is r; adds its gradient and
 // second derivative where there are a gradient and a matrix.
 template <class Fields>
-PALPATE double cone(const Fields& f, int r, int dim, const double* x, double h, double* g, const Envelope* H) {
+PALPATE double cone(const Fields& f, int r, int dim, const double* x, double h, double* g, const RodMatrix* H) {
   const RodRow<Fields> first{f, r};
   const double mu = first.friction(), per = 1.0 / (h * h);
   double u[6], slope[6], T2 = 0.0, cost = 0.0;
@@ -101,7 +103,7 @@ PALPATE double cone(const Fields& f, int r, int dim, const double* x, double h, 
 
 // The cost of all rows; adds its gradient and second derivative where there are a gradient and a matrix.
 template <class Fields>
-PALPATE double rows_cost(const Fields& f, const double* x, double h, double* g, const Envelope* H) {
+PALPATE double rows_cost(const Fields& f, const double* x, double h, double* g, const RodMatrix* H) {
   double cost = 0.0;
   const int n = f.count.data[0];
   for (int r = 0; r < n;) {
@@ -129,41 +131,57 @@ PALPATE double step_cost(const Fields& f, const double* x, const double* turn, d
     const D3 off = load(x + 3 * i) - load(f.aim.data + 3 * i);
     sum += 0.5 * f.mass.data[i] / (h * h) * dot(off, off) + 0.5 * f.spin.data[i] / (h * h) * turn[i] * turn[i];
   }
-  return sum + rod_energy(f, x, turn) + contacts_energy(f, x, h, nullptr, nullptr) +
+  return sum + rod_energy(f, x, turn) + contacts_energy(f, x, h, nullptr, nullptr, false) +
          h * h * rows_cost(f, x, h, nullptr, nullptr);
 }
 
-// The gradient and the matrix at a trial state, without the constraints' part.
+// The gradient at a trial state, and the matrix, see `add_rod`; both without what other bodies do.
 template <class Fields>
-PALPATE void assemble(const Fields& f, const double* x, const double* turn, double h, double* g) {
+PALPATE void assemble(const Fields& f, const double* x, const double* turn, double h, double* g, bool exact) {
   lay_out(f, x);
-  const Envelope H = matrix_of(f);
-  for (int a = 0; a < H.n; ++a) g[a] = 0.0;
+  const RodMatrix H = matrix_of(f);
   for (int a = 0; a < f.count.data[2]; ++a) H.value[a] = 0.0;
   for (int i = 0; i < f.nnode; ++i) {
-    for (int c = 0; c < 3; ++c) {
-      const double m = f.mass.data[i] / (h * h);
-      g[4 * i + c] = m * (x[3 * i + c] - f.aim.data[3 * i + c]);
-      H.at(4 * i + c, 4 * i + c) = m;
-    }
-    g[4 * i + 3] = f.spin.data[i] / (h * h) * turn[i];
-    H.at(4 * i + 3, 4 * i + 3) = f.spin.data[i] / (h * h);
+    const double m = f.mass.data[i] / (h * h), spin = f.spin.data[i] / (h * h);
+    store(g + 4 * i, m * (load(x + 3 * i) - load(f.aim.data + 3 * i)));
+    g[4 * i + 3] = spin * turn[i];
+    for (int c = 0; c < H.per; ++c) H.at(H.of(i, c), H.of(i, c)) = c < 3 ? m : spin;
   }
-  add_rod(f, x, turn, g, H);
-  contacts_energy(f, x, h, g, &H);
+  add_rod(f, x, turn, g, H, exact);
+  contacts_energy(f, x, h, g, &H, exact);
 }
 
 // Takes unknowns out that do not change.
 template <class Fields>
-PALPATE void hold(const Fields& f, double* g, const Envelope& H) {
-  for (int a = 0; a < H.n; ++a) {
-    double* row = H.row(a);
-    for (int b = H.first[a]; b <= a; ++b)
-      if (f.held.data[a] || f.held.data[b]) row[b] = 0.0;
-    if (!f.held.data[a]) continue;
-    g[a] = 0.0;
-    row[a] = 1.0;
+PALPATE void hold(const Fields& f, double* g, const RodMatrix& H) {
+  int count = 0;
+  int* held = f.below.data;
+  for (int i = 0; i < f.nnode; ++i) {
+    for (int c = 0; c < 4; ++c) {
+      if (!f.held.data[4 * i + c]) continue;
+      g[4 * i + c] = 0.0;
+      if (c < H.per) held[count++] = H.of(i, c);
+    }
   }
+  for (int a = 0; a < H.n && count; ++a)
+    for (int k = 0; k < count; ++k)
+      if (held[k] <= a && held[k] >= H.first[a]) H.row(a)[held[k]] = 0.0;
+  for (int k = 0; k < count; ++k) {
+    for (int b = H.first[held[k]]; b < held[k]; ++b) H.row(held[k])[b] = 0.0;
+    H.at(held[k], held[k]) = 1.0;
+  }
+}
+
+// A^-1 b in place of b, four numbers a node, from the factors.
+template <class Fields>
+PALPATE void solve_nodes(const Fields& f, double* b) {
+  const RodMatrix H = matrix_of(f);
+  double* y = f.ranked.data;
+  for (int i = 0; i < f.nnode; ++i)
+    for (int c = 0; c < H.per; ++c) y[H.of(i, c)] = b[4 * i + c];
+  solve_factorized(H, y);
+  for (int i = 0; i < f.nnode; ++i)
+    for (int c = 0; c < 4; ++c) b[4 * i + c] = c < H.per ? y[H.of(i, c)] : 0.0;
 }
 
 // Starts from where the nodes go with their last acceleration, as far as they do not meet.
@@ -198,13 +216,17 @@ PALPATE int step_rod(const Fields& f, double h) {
       note_pressure(f);
       cost = step_cost(f, x, turn, h);
     }
-    assemble(f, x, turn, h, g);
-    const Envelope H = matrix_of(f);
-    rows_cost(f, x, h, g, &H);
-    hold(f, g, H);
-    for (int a = 0; a < n; ++a) f.move.data[a] = -g[a];
-    factorize(H, f.trial.data);
-    solve_factorized(H, f.move.data);
+    const RodMatrix H = matrix_of(f);
+    bool exact = true;
+    for (;; exact = false) {
+      assemble(f, x, turn, h, g, exact);
+      rows_cost(f, x, h, g, &H);
+      hold(f, g, H);
+      for (int a = 0; a < n; ++a) f.move.data[a] = -g[a];
+      if (factorize(H, f.trial.data)) break;
+      if (!exact) return -1;
+    }
+    solve_nodes(f, f.move.data);
     double falls = 0.0, most = 0.0;
     for (int a = 0; a < n; ++a) falls += g[a] * f.move.data[a];
     for (int i = 0; i < f.nnode; ++i) {
@@ -228,7 +250,7 @@ PALPATE int step_rod(const Fields& f, double h) {
     for (int a = 0; a < 3 * f.nnode; ++a) x[a] = trial[a];
     for (int i = 0; i < f.nnode; ++i) turn[i] = trial_turn[i];
     // A move that was cut short by contacts is not the last one.
-    if (part * most < CLOSE * f.shortest && whole == 1.0) return iteration + 1;
+    if (part * most < CLOSE * f.radius && whole == 1.0) return iteration + 1;
   }
   return iteration;
 }

@@ -78,60 +78,116 @@ PALPATE double rod_energy(const Fields& f, const double* x, const double* turn) 
   return sum;
 }
 
-// Adds force * v to a gradient and stiffness v v^T to a matrix, v of `n` entries from unknown `at` on.
-PALPATE void add_term(
-    double* g, const Envelope& H, int at, const double* v, int n, double force, double stiffness) {
-  for (int a = 0; a < n; ++a) {
-    if (v[a] == 0.0) continue;
-    g[at + a] += force * v[a];
-    const double s = stiffness * v[a];
-    double* row = H.row(at + a) + at;
-    for (int b = 0; b <= a; ++b)
-      if (v[b] != 0.0) row[b] += s * v[b];
+// A matrix over the unknowns of nodes in an order in which those that have to do with each other are near.
+// Without twist a node has three.
+struct RodMatrix : Envelope {
+  const int* rank;  // of a node in that order
+  int per;          // unknowns of a node
+
+  PALPATE int of(int node, int c) const { return per * rank[node] + c; }
+};
+
+// What nodes add to the gradient, and to the matrix: the places of each, not its turn.
+template <int NODES>
+struct Terms {
+  static constexpr int COUNT = 3 * NODES;
+  double g[COUNT] = {}, K[COUNT][COUNT] = {};
+
+  // Force v, and stiffness v v^T.
+  PALPATE void add(const double* v, double force, double stiffness) {
+    for (int a = 0; a < COUNT; ++a) {
+      g[a] += force * v[a];
+      const double s = stiffness * v[a];
+      for (int b = 0; b < COUNT; ++b) K[a][b] += s * v[b];
+    }
+  }
+  // Along `axis`, by the nodes' weights.
+  PALPATE void add(const double* w, D3 axis, double force, double stiffness) {
+    double v[COUNT];
+    for (int k = 0; k < NODES; ++k) store(v + 3 * k, w[k] * axis);
+    add(v, force, stiffness);
+  }
+  // Along every axis.
+  PALPATE void add_each(const double* w, double stiffness) {
+    for (int k = 0; k < NODES; ++k)
+      for (int m = 0; m < NODES; ++m)
+        for (int c = 0; c < 3; ++c) K[3 * k + c][3 * m + c] += stiffness * w[k] * w[m];
+  }
+  PALPATE void scatter(const int* node, double* into, const RodMatrix& H) const {
+    for (int k = 0; k < NODES; ++k) {
+      for (int c = 0; c < 3; ++c) {
+        const int a = 3 * k + c;
+        into[4 * node[k] + c] += g[a];
+        for (int m = 0; m < k; ++m)
+          for (int d = 0; d < 3; ++d) H.at(H.of(node[k], c), H.of(node[m], d)) += K[a][3 * m + d];
+        for (int d = 0; d <= c; ++d) H.at(H.of(node[k], c), H.of(node[k], d)) += K[a][3 * k + d];
+      }
+    }
+  }
+};
+
+// Adds the gradient and second derivative of the twist at node i, but for that of the twist itself.
+template <class Fields>
+PALPATE void add_twist(const Fields& f, const Bent& b, int i, double twist, double* g, const RodMatrix& H) {
+  const D3 me = (0.5 / b.le) * b.curvature, mf = (0.5 / b.lf) * b.curvature;
+  double v[12] = {};  // of three nodes, and their turns
+  store(v, -1.0 * me);
+  v[3] = -1.0;
+  store(v + 4, me - mf);
+  v[7] = 1.0;
+  store(v + 8, mf);
+  for (int a = 0; a < 11; ++a) {
+    g[4 * i - 4 + a] += f.torsion.data[i] * twist * v[a];
+    for (int c = 0; c <= a; ++c)
+      H.at(H.of(i - 1 + a / 4, a % 4), H.of(i - 1 + c / 4, c % 4)) += f.torsion.data[i] * v[a] * v[c];
   }
 }
 
-// Adds the gradient of the energy, and of its second derivative what is positive: that of the squares
-// (Gauss and Newton), and the tension of edges.
+// Adds the gradient of the energy and its second derivative, or where that is not to be `exact` a part of it
+// that is positive: without the thrust of edges, and without what a moment does as edges turn.
 template <class Fields>
-PALPATE void add_rod(const Fields& f, const double* x, const double* turn, double* g, const Envelope& H) {
+PALPATE void add_rod(const Fields& f, const double* x, const double* turn, double* g, const RodMatrix& H, bool exact) {
   for (int i = 0; i + 1 < f.nnode; ++i) {
     const D3 e = load(x + 3 * i + 3) - load(x + 3 * i);
     const double l = norm(e) + 1e-300, k = f.stretch.data[i], tension = k * (l - f.length.data[i]);
-    const D3 t = (1.0 / l) * e;
-    double v[7] = {-t.x, -t.y, -t.z, 0.0, t.x, t.y, t.z};
-    const double across = tension > 0.0 ? tension / l : 0.0;
-    add_term(g, H, 4 * i, v, 7, tension, k - across);
-    for (int c = 0; c < 3; ++c) {
-      H.at(4 * i + c, 4 * i + c) += across;
-      H.at(4 * i + 4 + c, 4 * i + 4 + c) += across;
-      H.at(4 * i + 4 + c, 4 * i + c) -= across;
-    }
+    const double w[2] = {-1.0, 1.0}, across = exact || tension > 0.0 ? tension / l : 0.0;
+    Terms<2> terms;
+    terms.add(w, (1.0 / l) * e, tension, k - across);
+    terms.add_each(w, across);
+    const int node[2] = {i, i + 1};
+    terms.scatter(node, g, H);
   }
   for (int i = 1; i + 1 < f.nnode; ++i) {
+    // The energy is 2 B t^2, t the tangent of half the angle between the edges: in their plane a function
+    // of that angle, across it of how they turn against each other and with each other.
     const Bent b = bent(x, i);
-    const double k[3] = {b.curvature.x, b.curvature.y, b.curvature.z}, per = 1.0 / b.chi;
-    const D3 we = (b.lf / b.le) * b.e + b.f, wf = (b.le / b.lf) * b.f + b.e;
-    const D3 axis[3] = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}};
-    for (int r = 0; r < 3; ++r) {
-      // Row r of [a]x, as a vector, is axis x a.
-      const D3 de = per * (-2.0 * cross(axis[r], b.f) - k[r] * we);
-      const D3 df = per * (2.0 * cross(axis[r], b.e) - k[r] * wf);
-      double v[11] = {};
-      store(v, -1.0 * de);
-      store(v + 4, de - df);
-      store(v + 8, df);
-      add_term(g, H, 4 * i - 4, v, 11, f.bend.data[i] * k[r], f.bend.data[i]);
+    const double t = 0.5 * norm(b.curvature), B = f.bend.data[i], more = 1.0 + t * t;
+    const D3 e = (1.0 / b.le) * b.e, d = (1.0 / b.lf) * b.f;
+    const D3 axis = fabs(e.x) < 0.6 ? D3{1.0, 0.0, 0.0} : D3{0.0, 1.0, 0.0};
+    const D3 n = unit(t > 1e-12 ? b.curvature : cross(e, axis)), pe = cross(n, e), pf = cross(n, d);
+    Terms<3> terms;
+    const auto add = [&](D3 at_e, D3 at_f, double force, double stiffness) {
+      double v[9];
+      store(v, -1.0 * at_e);
+      store(v + 3, at_e - at_f);
+      store(v + 6, at_f);
+      terms.add(v, force, stiffness);
+    };
+    const double re = 1.0 / b.le, rf = 1.0 / b.lf, moment = 2.0 * B * t * more;
+    const D3 none = {0.0, 0.0, 0.0};
+    add(-re * pe, rf * pf, moment, B * more * (1.0 + 3.0 * t * t));
+    add(re * n, -rf * n, 0.0, B * more);
+    if (exact) {
+      add(re * n, rf * n, 0.0, -B * t * t * more);
+      const double se = 0.5 * moment * re * re, sf = 0.5 * moment * rf * rf;
+      add(e + pe, none, 0.0, se);
+      add(e - pe, none, 0.0, -se);
+      add(none, d + pf, 0.0, -sf);
+      add(none, d - pf, 0.0, sf);
     }
-    if (!f.twists) continue;
-    const D3 me = (0.5 / b.le) * b.curvature, mf = (0.5 / b.lf) * b.curvature;
-    double v[11] = {};
-    store(v, -1.0 * me);
-    v[3] = -1.0;
-    store(v + 4, me - mf);
-    v[7] = 1.0;
-    store(v + 8, mf);
-    add_term(g, H, 4 * i - 4, v, 11, f.torsion.data[i] * twist_at(f, x, turn, i), f.torsion.data[i]);
+    const int node[3] = {i - 1, i, i + 1};
+    terms.scatter(node, g, H);
+    if (f.twists) add_twist(f, b, i, twist_at(f, x, turn, i), g, H);
   }
 }
 

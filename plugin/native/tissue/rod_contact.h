@@ -11,10 +11,15 @@ namespace palpate {
 constexpr double LEFT = 0.2, FOUND = 0.9;
 // How far two edges that are listed may be apart before they touch: in radii, and in what the fastest
 // node goes in a step.
-constexpr double LISTED = 4.0, AHEAD = 3.0;
+constexpr double LISTED = 2.0, AHEAD = 3.0;
+constexpr double STRETCHED = 1.2;  // more than an edge ever is
 
 // The points of two segments, from p along d and from q along e, that are nearest (Ericson 2005, 5.1.9).
-struct Nearest { double s, t; D3 off; };
+struct Nearest {
+  double s, t;
+  D3 off;                 // from the second to the first
+  bool moves_s, moves_t;  // as the segments do; else it is an end
+};
 
 PALPATE double clamped(double a) { return a < 0.0 ? 0.0 : a > 1.0 ? 1.0 : a; }
 
@@ -22,12 +27,17 @@ PALPATE Nearest nearest(D3 p, D3 d, D3 q, D3 e) {
   const D3 r = p - q;
   const double a = dot(d, d), c = dot(e, e), f = dot(e, r), g = dot(d, r), b = dot(d, e);
   const double det = a * c - b * b;
-  double s = det > 1e-9 * a * c ? clamped((b * f - g * c) / det) : 0.5, t = (b * s + f) / c;
+  const double inner = det > 1e-9 * a * c ? (b * f - g * c) / det : 0.5;
+  double s = clamped(inner), t = (b * s + f) / c;
+  bool moves_s = s == inner && det > 1e-9 * a * c, moves_t = true;
   if (t < 0.0 || t > 1.0) {
+    moves_t = false;
     t = clamped(t);
-    s = clamped((b * t - g) / a);
+    const double free = (b * t - g) / a;
+    s = clamped(free);
+    moves_s = s == free;
   }
-  return {s, t, r + s * d - t * e};
+  return {s, t, r + s * d - t * e, moves_s, moves_t};
 }
 
 PALPATE Nearest nearest_edges(const double* x, int i, int j) {
@@ -64,16 +74,19 @@ template <class Fields>
 PALPATE bool list_near(const Fields& f, const double* x) {
   const int n = f.nnode;
   int count = 0;
-  const double far = 2.0 * f.radius + f.reach.data[0];
+  const double far = 2.0 * f.radius + f.reach.data[0], reach = far + f.longest;
   for (int i = 0; i + 1 < n; ++i) {
     const D3 a = 0.5 * (load(x + 3 * i) + load(x + 3 * i + 3));
-    double between = 0.0;
-    for (int j = i + 2; j + 1 < n && f.collides; ++j) {
-      between += f.length.data[j - 1];
-      if (between < NEIGHBOURS * f.radius) continue;
+    const double beyond = f.along.data[i + 1] + NEIGHBOURS * f.radius;
+    for (int j = i + 2, skip; j + 1 < n && f.collides; j += skip) {
+      skip = 1;
+      if (f.along.data[j] < beyond) continue;
       const D3 b = 0.5 * (load(x + 3 * j) + load(x + 3 * j + 3));
-      const double reach = far + f.longest, d2 = dot(a - b, a - b);
-      if (d2 > reach * reach) continue;
+      const double d2 = dot(a - b, a - b);
+      if (d2 > reach * reach) {  // so are all edges up to where the thread could be back
+        skip = 1 + (int)((sqrt(d2) - reach) / (STRETCHED * f.longest));
+        continue;
+      }
       const D3 off = nearest_edges(x, i, j).off;
       if (dot(off, off) > far * far) continue;
       if (count >= f.most_pairs) return false;
@@ -87,56 +100,143 @@ PALPATE bool list_near(const Fields& f, const double* x) {
   return true;
 }
 
-// Lists them, as far away as there is room.
+// Whether two edges can be no further from each other than `far`, by where their middles are.
+template <class Fields>
+PALPATE bool may_be_near(const Fields& f, const double* x, int i, int j, double far) {
+  const D3 a = load(x + 3 * i) + load(x + 3 * i + 3), b = load(x + 3 * j) + load(x + 3 * j + 3);
+  const double reach = 2.0 * (far + STRETCHED * f.longest);
+  return dot(a - b, a - b) < reach * reach;
+}
+
+#if ON_CUDA
+PALPATE int bits(unsigned word) { return __popc(word); }
+PALPATE int lowest_bit(unsigned word) { return __ffs(word) - 1; }
+#else
+PALPATE int bits(unsigned word) { return __builtin_popcount(word); }
+PALPATE int lowest_bit(unsigned word) { return __builtin_ctz(word); }
+#endif
+
+// Orders the nodes so that those that have to do with each other are near: next comes, of those that a
+// node before has to do with, the one that adds the fewest (King 1970, doi:10.1002/nme.1620020406).
+template <class Fields>
+PALPATE void order_nodes(const Fields& f, const double* x) {
+  const int n = f.nnode, words = (n + 31) / 32;
+  unsigned* near = (unsigned*)f.near.data;
+  const auto mark = [&](unsigned* row, int i) { row[i / 32] |= 1u << (i % 32); };
+  const auto has = [&](const unsigned* row, int i) { return row[i / 32] >> (i % 32) & 1; };
+  for (int a = 0; a < n * words; ++a) near[a] = 0;
+  const auto join = [&](int i, int j) {
+    mark(near + i * words, j);
+    mark(near + j * words, i);
+  };
+  for (int i = 0; i < n; ++i)
+    for (int j = i; j < n && j < i + 3; ++j) join(i, j);
+  for (int p = 0; p < f.count.data[1]; ++p) {
+    const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
+    if (!may_be_near(f, x, i, j, 2.5 * f.radius) || norm(nearest_edges(x, i, j).off) > 2.5 * f.radius) continue;
+    for (int a = i; a < i + 2; ++a)
+      for (int b = j; b < j + 2; ++b) join(a, b);
+  }
+  unsigned* seen = near + n * words;  // what a node before has to do with, and these
+  int* front = f.below.data;          // those of them that have no rank yet
+  for (int a = 0; a < words; ++a) seen[a] = 0;
+  int count = 0, next = 0;
+  for (int rank = 0; rank < n; ++rank) {
+    int best = -1, fewest = n + 1;
+    for (int k = 0; k < count; ++k) {
+      int adds = 0;
+      for (int a = 0; a < words; ++a) adds += bits(near[front[k] * words + a] & ~seen[a]);
+      if (adds < fewest) fewest = adds, best = k;
+    }
+    int node;
+    if (best < 0) {
+      while (has(seen, next)) ++next;
+      node = next;
+      mark(seen, node);
+    } else {
+      node = front[best];
+      for (int k = best; k + 1 < count; ++k) front[k] = front[k + 1];
+      --count;
+    }
+    f.rank.data[node] = rank;
+    for (int a = 0; a < words; ++a) {
+      unsigned adds = near[node * words + a] & ~seen[a];
+      seen[a] |= adds;
+      for (; adds; adds &= adds - 1) front[count++] = 32 * a + lowest_bit(adds);
+    }
+  }
+}
+
+// Lists pairs, as far away as there is room, and orders the nodes.
 template <class Fields>
 PALPATE void list_pairs(const Fields& f, const double* x) {
   while (!list_near(f, x)) f.reach.data[0] *= 0.5;
+  order_nodes(f, x);
+}
+
+// Unknowns of a node in the matrix.
+template <class Fields>
+PALPATE int unknowns_of(const Fields& f) { return f.twists ? 4 : 3; }
+
+template <class Fields>
+PALPATE RodMatrix matrix_of(const Fields& f) {
+  const int per = unknowns_of(f);
+  return {{f.matrix.data, f.first.data, f.start_of_row.data, per * f.nnode}, f.rank.data, per};
 }
 
 // The rows' first columns: of two neighbours along the rod, and of what touches at x or began the step so.
 template <class Fields>
 PALPATE void lay_out(const Fields& f, const double* x) {
-  const int n = 4 * f.nnode;
-  int* first = f.first.data;
-  for (int a = 0; a < n; ++a) {
-    const int node = a / 4, reach = a % 4 < 3 ? 2 : 1;
-    first[a] = node > reach ? 4 * (node - reach) : 0;
-    if (a % 4 == 3 && !f.twists) first[a] = a;
-  }
+  const int n = f.nnode, per = unknowns_of(f);
+  const int* rank = f.rank.data;
+  int* lowest = f.below.data;  // rank of what a node has to do with
+  for (int i = 0; i < n; ++i) lowest[i] = rank[i];
+  const auto join = [&](int i, int j) {
+    if (rank[i] < lowest[j]) lowest[j] = rank[i];
+    if (rank[j] < lowest[i]) lowest[i] = rank[j];
+  };
+  for (int i = 0; i < n; ++i)
+    for (int j = i + 1; j < n && j < i + 3; ++j) join(i, j);
   for (int p = 0; p < f.count.data[1]; ++p) {
     const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
-    const D3 off = nearest_edges(x, i, j).off;
-    if (f.pressure.data[p] == 0.0 && dot(off, off) >= 4.0 * f.radius * f.radius) continue;
-    for (int a = 4 * j; a < 4 * j + 7; ++a)
-      if (first[a] > 4 * i && a != 4 * j + 3) first[a] = 4 * i;
+    if (!(f.pressure.data[p] > 0.0)) {
+      if (!may_be_near(f, x, i, j, 2.0 * f.radius)) continue;
+      const D3 off = nearest_edges(x, i, j).off;
+      if (dot(off, off) >= 4.0 * f.radius * f.radius) continue;
+    }
+    for (int a = i; a < i + 2; ++a)
+      for (int b = j; b < j + 2; ++b) join(a, b);
   }
+  for (int i = 0; i < n; ++i)
+    for (int c = 0; c < per; ++c) f.first.data[per * rank[i] + c] = per * lowest[i];
   int at = 0;
-  for (int a = 0; a < n; ++a) {
+  for (int a = 0; a < per * n; ++a) {
     f.start_of_row.data[a] = at;
-    at += a - first[a] + 1;
+    at += a - f.first.data[a] + 1;
   }
   f.count.data[2] = at;
 }
 
-template <class Fields>
-PALPATE Envelope matrix_of(const Fields& f) {
-  return {f.matrix.data, f.first.data, f.start_of_row.data, 4 * f.nnode};
-}
-
-// Adds force (w . v) and stiffness v v^T for a vector v = w_k axis of the four nodes of a pair.
-PALPATE void add_pair(double* g, const Envelope& H, const int* node, const double* w, D3 axis, double force, double stiffness) {
-  const double a[3] = {axis.x, axis.y, axis.z};
+// Adds what a force between two edges does as they turn and as their nearest points move: the second derivative
+// of their distance, but for that along their normal, times `stiffness`, which is force over distance.
+PALPATE void add_turning(Terms<4>& terms, const double* x, const int* node, Nearest at, const double* w, double stiffness) {
+  terms.add_each(w, stiffness);
+  // The points are where the derivatives of half the distance squared by s and t are 0, or at an end.
+  const D3 d = load(x + 3 * node[1]) - load(x + 3 * node[0]), e = load(x + 3 * node[3]) - load(x + 3 * node[2]);
+  double by_s[12], by_t[12];
   for (int k = 0; k < 4; ++k) {
-    for (int c = 0; c < 3; ++c) {
-      const int row = 4 * node[k] + c;
-      const double v = w[k] * a[c];
-      g[row] += force * v;
-      if (stiffness == 0.0) continue;
-      for (int m = 0; m <= k; ++m)
-        for (int d = 0; d < 3; ++d)
-          if (4 * node[m] + d <= row) H.row(row)[4 * node[m] + d] += stiffness * v * w[m] * a[d];
-    }
+    const double of_d = k == 0 ? -1.0 : k == 1 ? 1.0 : 0.0, of_e = k == 2 ? -1.0 : k == 3 ? 1.0 : 0.0;
+    store(by_s + 3 * k, w[k] * d + of_d * at.off);
+    store(by_t + 3 * k, -w[k] * e - of_e * at.off);
   }
+  const double a = dot(d, d), b = -dot(d, e);
+  double c = dot(e, e);
+  if (at.moves_s) {
+    terms.add(by_s, 0.0, -stiffness / a);
+    for (int k = 0; k < 12; ++k) by_t[k] -= b / a * by_s[k];
+    c -= b * b / a;
+  }
+  if (at.moves_t) terms.add(by_t, 0.0, -stiffness / c);
 }
 
 // Friction of a pair by the displacement u along it: mu lambda f0(|u|), smooth below `slow`.
@@ -149,40 +249,63 @@ PALPATE Slip slip(double y, double slow) {
   return {slow * (z * z - z * z * z / 3.0 + 1.0 / 3.0), (2.0 - z) / slow, along};
 }
 
-// The energy of contacts at x; adds its gradient and second derivative where there are a gradient and a matrix.
+// What a pair notes as a step begins: where it touches on each edge, the normal, and the velocity below which its
+// friction is viscous, which is a share of its own: so friction is smooth for the solver as it slides, and
+// as it comes to rest the share goes with it.
+constexpr int TOUCH = 5;
+constexpr double SMOOTH = 0.3;
+
+// Of a vector of all nodes, such as their places, how much more the first edge of a pair has than the second,
+// where they touch and across the normal.
 template <class Fields>
-PALPATE double contacts_energy(const Fields& f, const double* x, double h, double* g, const Envelope* H) {
-  const double slow = f.slow * h;
+PALPATE D3 slid(const Fields& f, int p, const double* x) {
+  const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
+  const double* touch = f.touch.data + TOUCH * p;
+  const D3 normal = load(touch + 2), u = (1.0 - touch[0]) * load(x + 3 * i) + touch[0] * load(x + 3 * i + 3) -
+                                         (1.0 - touch[1]) * load(x + 3 * j) - touch[1] * load(x + 3 * j + 3);
+  return u - dot(u, normal) * normal;
+}
+
+// The energy of contacts at x; adds its gradient and second derivative where there are a gradient and a matrix,
+// see `add_rod`.
+template <class Fields>
+PALPATE double contacts_energy(const Fields& f, const double* x, double h, double* g, const RodMatrix* H, bool exact) {
+  const double slow = h * f.smooth.data[0];
   double sum = 0.0;
   for (int p = 0; p < f.count.data[1]; ++p) {
     const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
     const int node[4] = {i, i + 1, j, j + 1};
+    const double limit = f.friction * f.pressure.data[p];
+    if (!(limit > 0.0) && (limit < 0.0 || !may_be_near(f, x, i, j, 2.0 * f.radius))) continue;
     const Nearest at = nearest_edges(x, i, j);
     const double distance = norm(at.off);
     const Barrier b = barrier(f, distance);
-    if (b.energy > 0.0 && f.pressure.data[p] >= 0.0) {
+    const bool touches = b.energy > 0.0;
+    if (!touches && !(limit > 0.0)) continue;
+    Terms<4> terms;
+    if (touches) {
       sum += b.energy;
       if (g) {
-        const double w[4] = {1.0 - at.s, at.s, at.t - 1.0, -at.t};
-        add_pair(g, *H, node, w, (1.0 / distance) * at.off, b.slope, b.bend);
+        const double w[4] = {1.0 - at.s, at.s, at.t - 1.0, -at.t}, per = exact ? b.slope / distance : 0.0;
+        terms.add(w, (1.0 / distance) * at.off, b.slope, b.bend - per);
+        if (exact) add_turning(terms, x, node, at, w, per);
       }
     }
-    const double limit = f.friction * f.pressure.data[p];
-    if (!(limit > 0.0)) continue;
-    const double* touch = f.touch.data + 5 * p;  // s, t and the normal as the step began
-    const double w[4] = {1.0 - touch[0], touch[0], touch[1] - 1.0, -touch[1]};
-    const D3 normal = load(touch + 2);
-    D3 u = {0.0, 0.0, 0.0};
-    for (int k = 0; k < 4; ++k) u += w[k] * (load(x + 3 * node[k]) - load(f.start.data + 3 * node[k]));
-    u = u - dot(u, normal) * normal;
-    const double y = norm(u);
-    const Slip s = slip(y, slow);
-    sum += limit * s.energy;
-    if (!g) continue;
-    const D3 one = unit(cross(normal, fabs(normal.x) < 0.6 ? D3{1.0, 0.0, 0.0} : D3{0.0, 1.0, 0.0}));
-    const D3 along = y > 1e-12 * slow ? (1.0 / y) * u : one, across = cross(normal, along);
-    add_pair(g, *H, node, w, along, limit * s.per * y, limit * (s.per + s.along * y * y));
-    add_pair(g, *H, node, w, across, 0.0, limit * s.per);
+    if (limit > 0.0) {
+      const double* touch = f.touch.data + TOUCH * p;
+      const double w[4] = {1.0 - touch[0], touch[0], touch[1] - 1.0, -touch[1]};
+      const D3 normal = load(touch + 2), u = slid(f, p, x) - slid(f, p, f.start.data);
+      const double y = norm(u);
+      const Slip s = slip(y, slow);
+      sum += limit * s.energy;
+      if (g) {
+        const D3 one = unit(cross(normal, fabs(normal.x) < 0.6 ? D3{1.0, 0.0, 0.0} : D3{0.0, 1.0, 0.0}));
+        const D3 along = y > 1e-12 * slow ? (1.0 / y) * u : one, across = cross(normal, along);
+        terms.add(w, along, limit * s.per * y, limit * (s.per + s.along * y * y));
+        terms.add(w, across, 0.0, limit * s.per);
+      }
+    }
+    if (g) terms.scatter(node, g, *H);
   }
   return sum;
 }
@@ -191,15 +314,18 @@ PALPATE double contacts_energy(const Fields& f, const double* x, double h, doubl
 // nearer than can be, as where a state was set so: they do not meet until they are apart.
 template <class Fields>
 PALPATE void note_pressure(const Fields& f) {
+  f.smooth.data[0] = f.slow;
   for (int p = 0; p < f.count.data[1]; ++p) {
     const Nearest at = nearest_edges(f.start.data, f.pair.data[2 * p], f.pair.data[2 * p + 1]);
     const double distance = norm(at.off);
     const Barrier b = barrier(f, distance);
     f.pressure.data[p] = distance <= 2.0 * CORE * f.radius ? -1.0 : -b.slope;
-    double* touch = f.touch.data + 5 * p;
+    double* touch = f.touch.data + TOUCH * p;
     touch[0] = at.s;
     touch[1] = at.t;
     store(touch + 2, unit(at.off));
+    const double slides = SMOOTH * norm(slid(f, p, f.vel.data));
+    if (f.pressure.data[p] > 0.0 && slides > f.smooth.data[0]) f.smooth.data[0] = slides;
   }
 }
 
@@ -267,8 +393,10 @@ PALPATE double safe_part(const Fields& f, const double* x, const double* move, i
   const double room = 0.5 * f.reach.data[0] - moved_since(f, x);  // for what is not listed
   if (part * most > room) part = room / most;
   for (int p = 0; p < f.count.data[1]; ++p) {
-    if (f.pressure.data[p] >= 0.0)
-      part = safe_for(f, x, move, stride, f.pair.data[2 * p], f.pair.data[2 * p + 1], part);
+    const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
+    if (f.pressure.data[p] < 0.0) continue;
+    const double meets = 2.0 * CORE * f.radius + 2.0 / (1.0 - LEFT) * part * most;
+    if (may_be_near(f, x, i, j, meets)) part = safe_for(f, x, move, stride, i, j, part);
   }
   return part > 0.0 ? part : 0.0;
 }
