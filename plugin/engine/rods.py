@@ -78,8 +78,8 @@ class Rod:
   matrix: doubles("nentry")  # its second derivative, and the factors of that, see `Envelope`
   inverse: doubles("nentry")  # of the matrix without constraints, there
   rank: ints("nnode")  # of a node in the matrix
-  near: ints("nnode + 1", "nword_node")  # a bit for each two nodes that are neighbours in the matrix
-  ranked: doubles("nunknown")  # scratch
+  near: ints("nnode + 1", "nword_node")  # a bit for each two nodes: neighbours in the matrix
+  ranked: doubles("nunknown", 4)  # scratch
   first: ints("nunknown")  # first column of each row
   start_of_row: ints("nunknown")  # where it is
   below: ints("nunknown")  # scratch
@@ -232,13 +232,14 @@ def settings(organ: Declaration, friction: float) -> dict:
 def scratch(n: int) -> dict[str, np.ndarray]:
   """Returns the fields of `Rod` that a step of n nodes writes."""
   nodes = ("start", "vel", "last", "external", "aim", "place", "listed")
-  unknowns = ("force", "move", "trial", "ranked", "gradient", "first", "start_of_row", "below")
+  unknowns = ("force", "move", "trial", "gradient", "first", "start_of_row", "below")
   pairs, rows, entries = _MOST_PAIRS * n, _MOST_ROWS * n, 2 * n * (4 * n + 1)
   return dict(
     **{name: np.zeros((n, 3)) for name in nodes},
     **{name: np.zeros(4 * n) for name in unknowns},
     turn=np.zeros(n),
     rank=np.zeros(n),
+    ranked=np.zeros((4 * n, 4)),
     near=np.zeros(((n + 1), -(-n // 32))),
     matrix=np.zeros(entries),
     inverse=np.zeros(entries),

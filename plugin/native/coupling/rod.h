@@ -171,10 +171,11 @@ PALPATE void begin(const Host& host, double h) {
     lay_out(rod, rod.place.data);
     for (int a = 0; a < n; ++a) rod.force.data[a] = 0.0;
     rows_cost(rod, rod.place.data, h, rod.force.data, &H);
+    // What is not positive is left out: a thread about to buckle gives way at once, and tools would meet nothing.
     assemble(rod, rod.place.data, rod.turn.data, h, rod.gradient.data, false);
     hold(rod, rod.gradient.data, H);
-    factorize(H, rod.trial.data);
-    invert_there(H, inverse_of(rod), rod.below.data);
+    factorize_nodes(rod);
+    invert_there(H, inverse_of(rod), rod.below.data, rod.ranked.data);
   }
   for (int i = 0; i < rod.nnode; ++i) {
     if (!host.moves(i)) continue;

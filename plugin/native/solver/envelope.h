@@ -44,24 +44,39 @@ PALPATE double dot_of(const double* a, const double* b, int n) {
   return sum_of(s) + rest;
 }
 
-// L D L^T = A in place of A: the unit lower triangle L, and on its diagonal 1 / D. `u` is scratch, n long.
-// Returns whether A is positive definite, and stops where it is not.
+// L D L^T = A in place of A: the unit lower triangle L, and on its diagonal 1 / D. Every ROWS rows have the same
+// first column and are taken together. `u` is scratch, ROWS n long. Returns whether A is positive definite, and
+// stops where it is not.
+template <int ROWS>
 PALPATE bool factorize(const Envelope& A, double* u) {
-  for (int i = 0; i < A.n; ++i) {
+  for (int i = 0; i < A.n; i += ROWS) {
     const int lo = A.first[i];
-    double* row = A.row(i);
-    for (int j = lo; j < i; ++j) {  // u = L D of the row
+    for (int j = lo; j < i; ++j) {  // u = L D of the rows
+      const double* other = A.row(j);
       const int from = A.first[j] > lo ? A.first[j] : lo;
-      u[j] = row[j] - dot_of(u + from, A.row(j) + from, j - from);
+      V4 sum[ROWS];
+      for (int r = 0; r < ROWS; ++r) sum[r] = {0.0, 0.0, 0.0, 0.0};
+      int k = from;
+      for (; k + 4 <= j; k += 4)
+        for (int r = 0; r < ROWS; ++r) add_product(sum[r], ld4(u + r * A.n + k), ld4(other + k));
+      for (int r = 0; r < ROWS; ++r) {
+        double rest = sum_of(sum[r]);
+        for (int c = k; c < j; ++c) rest += u[r * A.n + c] * other[c];
+        u[r * A.n + j] = A.row(i + r)[j] - rest;
+      }
     }
-    const double least = 1e-12 * row[i];
-    double pivot = row[i];
-    for (int j = lo; j < i; ++j) {
-      row[j] = u[j] * A.row(j)[j];
-      pivot -= row[j] * u[j];
+    for (int r = 0; r < ROWS; ++r) {
+      double *row = A.row(i + r), *own = u + r * A.n;
+      for (int j = i; j < i + r; ++j) own[j] = row[j] - dot_of(own + lo, A.row(j) + lo, j - lo);
+      const double least = 1e-12 * row[i + r];
+      double pivot = row[i + r];
+      for (int j = lo; j < i + r; ++j) {
+        row[j] = own[j] * A.row(j)[j];
+        pivot -= row[j] * own[j];
+      }
+      if (!(pivot > least)) return false;
+      row[i + r] = 1.0 / pivot;
     }
-    if (!(pivot > least)) return false;
-    row[i] = 1.0 / pivot;
   }
   return true;
 }
@@ -79,20 +94,29 @@ PALPATE void solve_factorized(const Envelope& L, double* b) {
   }
 }
 
-// The entries of A^-1 there, from the factors (Erisman and Tinney 1975, doi:10.1145/360680.360704).
-PALPATE void invert_there(const Envelope& L, const Envelope& Z, int* below) {
+// The entries of A^-1 there, from the factors (Erisman and Tinney 1975, doi:10.1145/360680.360704). `below` and `u`
+// are scratch, n and 2 n long.
+PALPATE void invert_there(const Envelope& L, const Envelope& Z, int* below, double* u) {
+  double *column = u, *product = u + L.n;  // of L, and of Z with it
   int count = 0;  // rows after i that have column i, the last one first
   for (int i = L.n - 1; i >= 0; --i) {
     int kept = 0;
     for (int k = 0; k < count; ++k)
       if (L.first[below[k]] <= i) below[kept++] = below[k];
     count = kept;
+    const int last = count ? below[0] : i;
+    for (int k = i + 1; k <= last; ++k) column[k] = product[k] = 0.0;
+    for (int a = 0; a < count; ++a) column[below[a]] = L.row(below[a])[i];
+    for (int a = 0; a < count; ++a) {
+      const int k = below[a];
+      const double *row = Z.row(k), l = column[k];
+      product[k] += dot_of(row + i + 1, column + i + 1, k - i);
+      for (int m = i + 1; m < k; ++m) product[m] += row[m] * l;
+    }
     double sum = L.row(i)[i];
     for (int a = 0; a < count; ++a) {
-      double entry = 0.0;
-      for (int b = 0; b < count; ++b) entry -= L.row(below[b])[i] * Z.at(below[a], below[b]);
-      Z.at(below[a], i) = entry;
-      sum -= L.row(below[a])[i] * entry;
+      Z.at(below[a], i) = -product[below[a]];
+      sum += column[below[a]] * product[below[a]];
     }
     Z.at(i, i) = sum;
     below[count++] = i;

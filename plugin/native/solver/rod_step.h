@@ -172,6 +172,12 @@ PALPATE void hold(const Fields& f, double* g, const RodMatrix& H) {
   }
 }
 
+template <class Fields>
+PALPATE bool factorize_nodes(const Fields& f) {
+  const RodMatrix H = matrix_of(f);
+  return f.twists ? factorize<4>(H, f.ranked.data) : factorize<3>(H, f.ranked.data);
+}
+
 // A^-1 b in place of b, four numbers a node, from the factors.
 template <class Fields>
 PALPATE void solve_nodes(const Fields& f, double* b) {
@@ -223,7 +229,7 @@ PALPATE int step_rod(const Fields& f, double h) {
       rows_cost(f, x, h, g, &H);
       hold(f, g, H);
       for (int a = 0; a < n; ++a) f.move.data[a] = -g[a];
-      if (factorize(H, f.trial.data)) break;
+      if (factorize_nodes(f)) break;
       if (!exact) return -1;
     }
     solve_nodes(f, f.move.data);
