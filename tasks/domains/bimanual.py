@@ -4,8 +4,9 @@ The action has the grasper's components, then those of the hook: `hook_pitch`, `
 `hook_roll`, `hook_insertion`, and `hook_current`, which is on above 0.
 
 Own observations: those of `dissect`, and `hook_front` (3,), from the hook's tip to the nearest bond
-that holds [m]; `retracted` (1,), how far the site is from its place at rest, away from the bed, as
-a share of what is needed [-]; `burnt` (1,), share of the burn that is damage [-].
+that holds [m]; `hook_gap` (1,), how far its strand is from the current's reach, negative within it
+[m]; `retracted` (1,), how far the site is from its place at rest, away from the bed, as a
+share of what is needed [-]; `burnt` (1,), share of the burn that is damage [-].
 
 A current frees the bonds whose strands the hook's wire touches in 0.2 s: a strand goes from the bed
 to the organ and is as thick as its skin, and a spark leaps 0.3 mm to it. What comes free while the
@@ -107,6 +108,7 @@ class State(dissect.State):
   powered: float  # how long it was on [s]
   wasted: float  # with no bond in reach [s]
   hook_front: Vector
+  hook_gap: float
   retracted: float
   burnt: float
 
@@ -150,10 +152,9 @@ def _divide(s, o):
 
 
 def nearest(s):
-  """Returns where the bond is that holds and is nearest to the hook's tip [m]."""
-  bonds = s.organ.bonds
-  far = np.linalg.norm(bonds.positions - other_tip(s), axis=1)
-  return bonds.positions[np.where(bonds.free, np.inf, far).argmin()]
+  """Returns which bond of those that hold is nearest to the hook's tip."""
+  far = np.linalg.norm(s.organ.bonds.positions - other_tip(s), axis=1)
+  return int(np.where(s.organ.bonds.free, np.inf, far).argmin())
 
 
 @many(nearest)
@@ -164,7 +165,7 @@ def _nearest(s):
     if far < least and not is_free(s, k):
       least = far
       found = k
-  return bond(s, found)
+  return found
 
 
 def act(s, o):
@@ -190,9 +191,11 @@ def advance(s, o):
 
 
 def observe(s, o):
-  """Finds what `dissect` does, hook_front, retracted and burnt."""
+  """Finds what `dissect` does, hook_front, hook_gap, retracted and burnt."""
   o = look(s, o)
-  o.hook_front = nearest(s) - other_tip(s)
+  k = nearest(s)
+  o.hook_front = bond(s, k) - other_tip(s)
+  o.hook_gap = strand_distance(s, k, other_point(s, o.heel), other_point(s, o.toe)) - o.reach
   o.retracted = retraction(s, o) / AWAY
   o.burnt = min(o.time / BURN, 1.0)
   return o
@@ -205,7 +208,7 @@ class Bimanual(Dissect):
     State,
     advance,
     observe,
-    (*Dissect.rules.observed, "hook_front", "retracted", "burnt"),
+    (*Dissect.rules.observed, "hook_front", "hook_gap", "retracted", "burnt"),
     METRICS | {"current_time": "powered", "current_wasted": "wasted"},
     act,
     mark=Dissect.rules.mark,
