@@ -60,8 +60,9 @@ AWAY = 0.005  # least way of the site from the bed, for what is divided to count
 RATE = 5.0  # damage that the current does to bonds [1/s]
 WIRE = "hook_toe"  # geom of the hook that has it
 TOUCHING, BURN = 0.03, 0.5  # force with which the hook touches [N], time that it may burn [s]
-# Of that time, what is forgotten in a second: a millimetre of tissue cools in d^2 / (4 a), with
-# a = 1.4e-7 m^2/s (Niemz 2007, Laser-Tissue Interactions, 3.2). Hands are late by 0.1 s.
+# Of that time, what is forgotten in a second: a millimetre of tissue cools in d^2 / (4 a), with the
+# a = 1.4e-7 m^2/s of water (van Gemert and Welch 1989, 10.1002/lsm.1900090414; Niemz 2007, Laser-
+# Tissue Interactions, 3.2). Hands are late by 0.1 s.
 COOLING = BURN / (1e-3**2 / (4 * 1.4e-7))
 HOOK_LIMIT, HOOK_DAMAGE = 1.5, 3.0  # of its force, as of other tips without jaws [N]
 SCENE = dataclasses.replace(
