@@ -13,7 +13,9 @@ ARCS = {"1/4": 0.25, "3/8": 0.375, "1/2": 0.5, "5/8": 0.625}  # of a circle
 # Width of the slit that a tip opens over the diameter: the edges of a cutting one are as wide, and
 # a cone tears a crack of about half (Shergold and Fleck 2004, doi:10.1098/rspa.2004.1315).
 TIPS = {"taper": 0.5, "cutting": 1.0}
-_STEEL = 7900.0  # [kg/m^3]
+# Thirty times that of steel: MuJoCo's contacts are as stiff as what they hold is heavy, and jaws
+# would close on 0.07 g as on nothing. Its weight, 0.02 N, is still none of a suture's forces.
+_MASS = 0.002  # [kg]
 _CAPSULES = 16  # of the arc
 _POINT = (0.7, 0.35)  # radius of the last two over that of the others
 _NEAR = 1e-4  # from the swage to the first node of a thread [m]
@@ -33,7 +35,7 @@ def add_needle(
   parent: mujoco.MjsBody | str | None = None,
   pos: Sequence[float] = (0.0, 0.0, 0.0),
   quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
-  density: float = _STEEL,
+  mass: float = _MASS,
   rgba: Sequence[float] = _RGBA,
   contact: Mapping[str, object] | None = None,
 ) -> mujoco.MjsBody:
@@ -57,7 +59,7 @@ def add_needle(
     parent: what it is fixed in; None for the world, in which it is free
     pos: of the circle's centre in the parent [m]
     quat: orientation in the parent
-    density: [kg/m^3]
+    mass: [kg]; some 0.07 g are real, but too light to be held by MuJoCo's contacts
     rgba: colour
     contact: attributes of the geoms that are not as usual: condim, friction, contype, ...
 
@@ -71,7 +73,7 @@ def add_needle(
     if value not in known:
       raise ValueError(f"needle {name!r}: {what} is {value!r}, expected one of {', '.join(known)}")
   for what, value, most in (("length", length, 1.0), ("diameter", diameter, length / 4),
-                            ("density", density, np.inf)):  # fmt: skip
+                            ("mass", mass, np.inf)):  # fmt: skip
     if not 0 < value < most:
       raise ValueError(f"needle {name!r}: {what} is {value:g}, expected above 0, below {most:g}")
   if not name or name in {body.name for body in spec.bodies}:
@@ -92,11 +94,10 @@ def add_needle(
     point = _CAPSULES - k  # from the tip, 1 for the last
     thick = _POINT[len(_POINT) - point] if point <= len(_POINT) else 1.0
     ends, radius = np.concatenate([points[k], points[k + 1]]), 0.5 * thick * diameter
-    mass = density * np.pi * radius**2 * length / _CAPSULES  # without the caps, which overlap
     meets = {"contype": 0, "conaffinity": 0} if thread is not None and k == 0 else {}
     body.add_geom(
       name=f"{name}_{k}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends,
-      size=[radius, 0, 0], mass=mass, rgba=rgba, **(look | meets),
+      size=[radius, 0, 0], mass=mass / _CAPSULES, rgba=rgba, **(look | meets),
     )  # fmt: skip
   for end, k, half in (("swage", 0, diameter / 2), ("tip", -1, TIPS[tip] * diameter / 2)):
     along = (-np.sin(angle[k]), np.cos(angle[k]), 0.0)

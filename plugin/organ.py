@@ -12,6 +12,7 @@ from palpate.engine.layout import FLAG
 from palpate.engine.model import mjstruct
 from palpate.engine.windows import windowed
 from palpate.forces.cutters import Cutter
+from palpate.forces.needles import Needle, Pinhole
 from palpate.tissue import energy
 from palpate.tissue.config import Config
 from palpate.tissue.cutting.topology import Piece, Report, pieces
@@ -212,6 +213,17 @@ class Organ:
   def cutters(self) -> tuple[Cutter, ...]:
     """What cuts it (key `cutters`): whether it is in the tissue, its force, energy and length."""
     return tuple(self._space.cutters.read())
+
+  @property
+  def needles(self) -> tuple[Needle, ...]:
+    """What goes through it (key `needles`): whether it is in the tissue, its force and energy."""
+    x = self._organ.origin + (self._organ.mesh.rest + self._deformation) @ self._organ.frame.T
+    return tuple(self._space.needles.read(x))
+
+  @property
+  def pinholes(self) -> tuple[Pinhole, ...]:
+    """Where needles go through its surface, those of each in the order in which it made them."""
+    return tuple(hole for needle in self.needles for hole in needle.holes if not hole.inside)
 
   @property
   def pieces(self) -> tuple[Piece, ...]:

@@ -22,7 +22,7 @@ def suture(swage, edge=2e-3):
 
 @pytest.mark.parametrize(("arc", "share"), [("3/8", 0.375), ("1/2", 0.5)])
 def test_its_arc_is_a_part_of_a_circle(arc, share):
-  """Ends, tangents, mass and size are those of an arc of steel wire."""
+  """Ends, tangents, mass and size are those of an arc of wire."""
   spec = mujoco.MjSpec()
   palpate.add_needle(spec, "needle", arc=arc, length=LENGTH, diameter=DIAMETER, tip="cutting")
   model, data = load(spec)
@@ -33,8 +33,9 @@ def test_its_arc_is_a_part_of_a_circle(arc, share):
   along = tip.xmat.reshape(3, 3)[:, 2]
   assert along @ tip.xpos == pytest.approx(0, abs=1e-12)
   assert along[1] * np.cross(swage.xpos, tip.xpos)[2] >= -1e-12
-  wire = 7900 * np.pi * DIAMETER**2 / 4 * LENGTH
-  assert model.body("needle").mass[0] == pytest.approx(wire, rel=0.1)  # the point is thinner
+  middle = circle * np.sin(np.pi * share) / (np.pi * share)  # of an arc's mass
+  assert model.body("needle").ipos == pytest.approx([middle, 0, 0], abs=0.01 * middle)
+  assert model.body("needle").mass[0] == pytest.approx(0.002)
   assert model.site("needle_tip").size[0] == pytest.approx(DIAMETER / 2)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -95,6 +96,14 @@ class Host(host.Host):
       nelem=mesh.nelem, ntet=len(mesh.tet), mesh=patch.mesh, elem=patch.elem, tet=patch.tet,
       flat=patch.rest, own=own, solve=solve,
     )  # fmt: skip
+
+  @functools.cached_property
+  def _lifted(self) -> wp.array:
+    return self.zeros(self._batch.bare.ngeom, dtype=int)
+
+  def lifted(self) -> wp.array:
+    """See `Host`."""
+    return self._lifted
 
   def tools(self, name: str) -> np.ndarray:
     """See `Host`."""

@@ -94,6 +94,8 @@ def _enter(w: Workspace, does: Phases):
 def _scatter(w: Workspace, does: Phases):
   does.scatter()
   w.forces.act()
+  if w.needles:
+    contacts.lift.launch("cpu", 1, 1, 0, w.views["weights"])
 
 
 def _advance(w: Workspace, does: Phases, ends: bool):
@@ -143,7 +145,7 @@ def _touched(w: Workspace, model: int) -> contacts.Weights:
   flexes = declare_windows.touching(model, w.seen.instance)
   out = contacts.make(model, w.data, flexes, w.report.flags)
   out.mine.numpy()[w.organ.flexes] = 2
-  w.views["mine"] = out.mine
+  w.views |= {"mine": out.mine, "weights": out}
   return out
 
 

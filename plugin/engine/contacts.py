@@ -65,6 +65,7 @@ _USUAL = (0.02, 1, 0.9, 0.95, 0.001, 0.5, 2)  # MuJoCo's solref and solimp
 # Those of `add_organ`, by which an organ does not say how firm its contacts are either.
 SOLREF, SOLIMP = (0.004, 1), (0.95, 0.99, 0.001)
 _tissue: dict[int, tuple] = {}  # by the address of an mjData, see `tell`
+_lifted: dict[int, np.ndarray] = {}  # by that, see `lifted`
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
 
@@ -78,6 +79,8 @@ class Weights:
   mine: ints("nflex")  # 1 where a flex is an organ's, or a window of one; 2 where of the own one
   flags: ints(len(FLAG))  # see FLAG
   tissue: doubles("nflex", len(TISSUE))  # see TISSUE
+  ngeom: int  # geoms of the model
+  lifted: ints("nflexgeom")  # whether a geom does not touch a flex, see `lifted`
   force_adr: ints("nflexvert")  # where the plugin state has a vertex' contact force, or -1
   # mjOption:
   jacobian: ints(1)
@@ -143,7 +146,9 @@ CONSTANTS = (
     "ENABLE_DIAGEXACT": int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
   }
 )
-weigh = kernel("weigh", "coupling/contact_weights.h", Weights, CONSTANTS)
+weigh, lift = (
+  kernel(name, "coupling/contact_weights.h", Weights, CONSTANTS) for name in ("weigh", "lift")
+)
 
 
 @functools.cache
@@ -185,11 +190,21 @@ def make(model: int, data: int, flexes, flags: np.ndarray | memoryview | None = 
   tissue, adr = _tissues(model, data)
   out.tissue = wp.array(tissue, dtype=wp.float64, device="cpu", copy=False)
   out.force_adr = wp.array(adr, dtype=int, device="cpu", copy=False)
+  out.ngeom = mjstruct.Model.from_address(model).ngeom
+  out.lifted = wp.array(lifted(model, data).ravel(), dtype=int, device="cpu", copy=False)
   out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
   out.mine = wp.array(mine, dtype=int, device="cpu")
   flags = np.zeros(len(FLAG), np.int32) if flags is None else flags
   out.flags = wp.array(np.asarray(flags), dtype=int, device="cpu", copy=False)
   return out
+
+
+def lifted(model: int, data: int) -> np.ndarray:
+  """Returns whether a flex and a geom do not touch in an mjData, as needles say, (nflex, ngeom)."""
+  m = mjstruct.Model.from_address(model)
+  if data not in _lifted or _lifted[data].shape != (m.nflex, m.ngeom):
+    _lifted[data] = np.zeros((m.nflex, m.ngeom), np.int32)
+  return _lifted[data]
 
 
 def _tissues(model: int, data: int) -> tuple[np.ndarray, np.ndarray]:
@@ -222,6 +237,7 @@ def tell(w: "Workspace", model: int):
 def forget(data: int):
   """Forgets what organs have told of an mjData that is freed."""
   _tissue.pop(data, None)
+  _lifted.pop(data, None)
 
 
 def tissue_of(m, organ: "Declaration", config: Config | None = None, mass=1.0) -> np.ndarray:

@@ -252,7 +252,7 @@ def sizes(organ: "Declaration") -> dict[str, int]:
   whole = organ.mesh.whole
   out |= cut_sizes(whole.nelem, whole.nvert, whole.spare, bool(len(whole.tet)))
   out["nbond"] = int(organ.free[: outer(organ)].sum()) if organ.config.bonded else 0
-  out["nblade"] = len(organ.config.cutters)
+  out |= {"nblade": len(organ.config.cutters), "nneedle": len(organ.config.needles)}
   solid = len(organ.mesh.tet) > 0
   if organ.windows is None:
     return out | nodal_sizes(organ.nfree, 3 * (organ.mesh.nvert - organ.mesh.nskin) * solid)

@@ -12,7 +12,7 @@ from palpate.tissue.types import fill
 
 from ..forces import host
 from ..forces.host import Bodies, Input, Nodes, Twin
-from . import coupling, layout
+from . import contacts, coupling, layout
 from .layout import FLAG, TAIL, NodalState, WindowState
 from .model import mjstruct
 from .model.declare import Declaration
@@ -64,12 +64,14 @@ class Host(host.Host):
     self.state = coupling.plugin_state(model, self.data, self.instance, size)
     self.own = layout.carve(kind, self.state, sizes)
     self.bodies = coupling.mujoco_arrays(model, self.data, Bodies)
-    motion, none = self.own.motion if organ.windows else None, np.zeros((0, 3))
+    motion = self.own.motion if organ.windows else self.own
+    disp, vel = (array.reshape((-1, 3)) for array in (motion.disp, motion.vel))
     values = dict(
-      windowed=int(motion is not None),
+      windowed=int(organ.windows is not None),
+      inner=organ.mesh.nskin,
       rest=self._rest,
-      disp=motion.disp if motion else none,
-      vel=motion.vel if motion else none,
+      disp=disp,
+      vel=vel,
       qposadr=organ.qposadr,
       dofadr=organ.dofadr,
       frame=organ.frame,
@@ -80,8 +82,11 @@ class Host(host.Host):
     self._fill_input()
 
   def _from(self) -> np.ndarray:
-    """Returns what displacements are from: nodal, qpos0 whatever was cut [m], (nvert, 3)."""
-    return self.organ.mesh.rest if self.organ.windows else self.organ.mesh.whole.rest
+    """Returns what displacements are from: of dofs, qpos0 whatever was cut [m], (nvert, 3)."""
+    mesh = self.organ.mesh
+    if self.organ.windows:
+      return mesh.rest
+    return np.concatenate([mesh.whole.rest[: mesh.nskin], mesh.rest[mesh.nskin :]])
 
   def _fill_input(self):
     values = {name: self.arrays[name] for name in ("force_ext", "vel", "dvel", "status")}
@@ -113,6 +118,12 @@ class Host(host.Host):
         self._surface[name] = wp.array(values, dtype=kinds[name], device="cpu")
         self._there[name] = self._surface[name].numpy()
     return self._surface
+
+  def lifted(self) -> wp.array:
+    """See `Host`."""
+    flex = self.organ.windows.flex if self.organ.windows else self.organ.flex
+    row = contacts.lifted(self.model, self.data)[flex : flex + 1]
+    return wp.array(row, dtype=int, device="cpu", copy=False)
 
   def tools(self, name: str) -> np.ndarray:
     """See `Host`."""

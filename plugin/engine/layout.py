@@ -16,6 +16,7 @@ from palpate.tissue.types import DIMS, doubles, struct
 
 WALLS = 4  # triangles that cuts of a solid may open, for one spare vertex
 LIPS = 3  # edges that cuts of a sheet may open, for one spare vertex
+HOLES = 20  # of a needle in an organ, at once
 TRAIL = 12  # points of the path of a blade that has not come apart yet
 
 
@@ -175,6 +176,39 @@ LAW = Numbers(
   ("solid", 1, "-", "whether it is a solid"),
 )
 
+# A hole that a needle has made, or a point of its way inside of a solid.
+HOLE = Numbers(
+  "HOLE",
+  ("kind", 1, "-", "0 into a solid, 1 in it, 2 out of it, 3 through a sheet"),
+  ("elem", 1, "-", "its triangle, or inside its tetrahedron"),
+  ("share", 3, "-", "of the corners but the first"),
+  ("slip", 1, "m", "place on the needle at which friction is at rest"),
+)
+
+# Of the plugin state: a needle, see `forces/needles.h`.
+NEEDLE = Numbers(
+  "NEEDLE",
+  ("stage", 1, "-", "of its tip: 0 away, 1 at a surface, 2 in a solid"),
+  ("depth", 1, "m", "how far that has pierced a sheet"),
+  ("elem", 1, "-", "triangle of its seat, or inside its tetrahedron"),
+  ("share", 3, "-", "of the corners but the first"),
+  ("work", 1, "J", "what piercing has taken"),
+  ("count", 1, "-", "holes, the first made first"),
+  ("hole", HOLES * len(HOLE), "-", "see HOLE"),
+)
+
+# What a needle meets.
+PIERCE = Numbers(
+  "PIERCE",
+  ("force", 1, "N", "that tissue bears of its tip, along it"),
+  ("surface", 1, "N", "that the surface of a solid bears"),
+  ("friction", 1, "N/m", "by length in tissue"),
+  ("stiffness", 1, "N/m", "of what ties it to a hole"),
+  ("wall", 1, "m", "thickness of a sheet, 0 of a solid"),
+  ("clear", 1, "m", "how far a tip is off its seat before it may skid"),
+  ("margin", 1, "m", "before its first hole, from where on it has no contacts"),
+)
+
 # The last numbers of the plugin state of a windowed organ.
 TAIL = Numbers(
   "TAIL",
@@ -189,10 +223,11 @@ TAIL = Numbers(
 
 TABLES = (
   FLAG, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, BOND, BLADE, LAW,
-  TAIL,
+  HOLE, NEEDLE, PIERCE, TAIL,
 )  # fmt: skip
 CONSTANTS = {
   "TRAIL": TRAIL,
+  "HOLES": HOLES,
   **{name: value for table in TABLES for name, value in table.constants().items()},
 }
 
@@ -209,7 +244,7 @@ class Topology:
 
 
 # Its sizes where there is no room, and that of what cuts.
-NO_CUTS = {"nblade": 0, "ncorner": 0, "nplace": 0, "nspare": 0, "ncuts": 0}
+NO_CUTS = {"nblade": 0, "nneedle": 0, "ncorner": 0, "nplace": 0, "nspare": 0, "ncuts": 0}
 
 
 @struct
@@ -224,6 +259,7 @@ class NodalState:
   relaxation: doubles("nrelax", 6)  # see `forces/relaxation.h` [N]
   bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
   blade: doubles("nblade", len(BLADE))  # of each geom that cuts, see BLADE
+  needle: doubles("nneedle", len(NEEDLE))  # of each needle, see NEEDLE
   cuts: Topology
   heavier: doubles(1)  # how many times its inertia at rest a tool meets; 0 for once [-]
   signature: doubles(1)  # of the organ, see `Declaration`; 0 where it was set by hand [-]
@@ -248,6 +284,7 @@ class WindowState:
   relaxation: doubles("nrelax", 6)  # see `forces/relaxation.h` [N]
   bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
   blade: doubles("nblade", len(BLADE))  # of each geom that cuts, see BLADE
+  needle: doubles("nneedle", len(NEEDLE))  # of each needle, see NEEDLE
   slip: doubles("nrest", 3)  # how far nodes have slipped on what they rest on [m]
   slot: doubles("nslot")  # node + 1; 0: the slot's default node, -1: not used
   cuts: Topology

@@ -17,6 +17,7 @@ from ..forces import declare_attachments, declare_bonds, supports
 from ..forces.attachments import Attachments
 from ..forces.cohesive_bonds import Bonds
 from ..forces.cutters import Cutters
+from ..forces.needles import Needles
 from ..forces.passive import Forces
 from ..forces.supports import Supports
 from ..forces.table import FORCES
@@ -205,6 +206,11 @@ class Workspace:
   def cutters(self) -> Cutters:
     """What cuts it."""
     return self.forces.of(Cutters)
+
+  @property
+  def needles(self) -> Needles:
+    """What goes through it."""
+    return self.forces.of(Needles)
 
   @property
   def supports(self) -> Supports:
@@ -465,6 +471,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     supports.check(host)
     declare_bonds.declare(w.bonds, host)
     w.cutters.declare()
+    w.needles.declare()
     bind(w, model)
     w.seen.signature = w.plugin_state[coupling.spans(organ)["signature"]].data
     if w.turn is not None:
@@ -538,4 +545,5 @@ def refresh(w: Workspace):
     feel(w, m)
     contacts.tell(w, w.model)
     w.cutters.refresh([w.config.thickness])
+    w.needles.refresh()
     w.seen.time_step = float(m.opt.timestep)

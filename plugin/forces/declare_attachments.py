@@ -113,7 +113,7 @@ def carried(host: Host) -> list[Group]:
   return [Group(Grip(mesh, vert), body, made, by="carrier")]
 
 
-def find_body(host: Host, key: str, name: str) -> int:
+def find_body(host: base.Host, key: str, name: str) -> int:
   """Returns the body that an organ's configuration names, by its own name or with its prefix."""
   m = host.m
   names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]

@@ -57,16 +57,22 @@ class Bodies:
   geom_xpos: doubles("ngeom", 3)
   geom_xmat: doubles("ngeom", 9)
   qfrc_passive: doubles("nv")
+  M: doubles("nC")
+  M_rowadr: ints("nv")
+  M_rownnz: ints("nv")
+  qLD: doubles("nC")
+  qLDiagInv: doubles("nv")
 
 
 @struct
 class Nodes:
   """Where an organ's vertices are: in MuJoCo's memory, or with windows in the plugin state."""
 
-  windowed: int  # whether it is in the plugin state
+  windowed: int  # whether all is in the plugin state
+  inner: int  # the first vertex inside of a solid, which are there anyway
   rest: doubles("nvert", 3)  # rest position [m]
-  disp: doubles("nvert", 3)  # displacement, of an organ with windows [m]
-  vel: doubles("nvert", 3)  # velocity, of one with windows [m/s]
+  disp: doubles("nstate", 3)  # displacement, of what is there [m]
+  vel: doubles("nstate", 3)  # velocity, of that [m/s]
   qposadr: ints("nvert")  # first qpos, of one without; -1 for pinned ones
   dofadr: ints("nvert")  # first dof
   frame: doubles(3, 3)  # rotation from the organ's axes to the world
@@ -203,6 +209,10 @@ class Host(abc.ABC):
   @abc.abstractmethod
   def surface(self) -> dict[str, Any]:
     """Returns fields with the meshes: `mesh`, `elem`, `tet`, `flat`, and what numbers are of."""
+
+  @abc.abstractmethod
+  def lifted(self) -> wp.array:
+    """Returns where forces say whether a geom does not touch the organ, (nworld, ngeom)."""
 
   @abc.abstractmethod
   def tools(self, name: str) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from .attachments import Attachments
 from .cohesive_bonds import Bonds
 from .cutters import Cutters
+from .needles import Needles
 from .passive import Force
 from .relaxation import Relaxation
 from .supports import Supports
@@ -16,6 +17,7 @@ FORCES: dict[str, type[Force]] = {
   "bonds": Bonds,
   "supports": Supports,
   "relaxation": Relaxation,
+  "needles": Needles,
   "tears": Tears,
   "cutters": Cutters,
 }

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from . import reading
-from .reading import BondRow, CutterRow
+from .reading import BondRow, CutterRow, NeedleRow
 from .step import SCHEMES
 
 # What takes a change while running: a number in the device's memory, the tissue's arrays, the graph
@@ -232,6 +232,18 @@ class Config:
     "([cutters](cutting.md#cutters)): `scalpel/edge 160, scissors/edge_left scissors/edge_right "
     "160, hook/hook_toe 1.1e6 by current`",
     "-, J/m²",
+  )
+  needles: tuple[NeedleRow, ...] = _row(
+    (),
+    (
+      reading.needles,
+      "a body, an energy > 0, and if wanted a friction >= 0 and an energy > 0 of the surface, a "
+      "comma between such groups",
+    ),
+    "needles (`add_needle`) that may go through the organ, the energy that it takes to open an "
+    "area, friction by length of needle in tissue, and the energy of a solid's surface where it "
+    "differs ([needles](authoring.md#needles)): `needle 800 15 1600`",
+    "-, J/m², N/m, J/m²",
   )
   resident: bool = _row(
     False,
@@ -459,7 +471,7 @@ def _check_spare(organ: str, config: Config):
 
 
 def _check_ties(organ: str, config: Config):
-  for key in ("carrier", "attach", "bonds", "relax_share", "support", "cutters"):
+  for key in ("carrier", "attach", "bonds", "relax_share", "support", "cutters", "needles"):
     if not getattr(config, key) and not (key == "bonds" and config.bonded):
       continue
     if config.resident:

@@ -210,6 +210,35 @@ def cutters(text: str, nelem: int) -> tuple[CutterRow, ...]:
   return tuple(found)
 
 
+class NeedleRow(NamedTuple):
+  """A needle, as a configuration declares it.
+
+  Attributes:
+    name: of its body
+    energy: that it takes to open an area [J/m^2]
+    friction: by length in tissue [N/m]
+    surface: energy that it takes to open the surface of a solid [J/m^2]
+  """
+
+  name: str
+  energy: float
+  friction: float
+  surface: float
+
+
+def needles(text: str, nelem: int) -> tuple[NeedleRow, ...]:
+  """Returns groups of a body and an energy, with a friction, and with the surface's energy."""
+  found = []
+  for group in text.split(","):
+    name, energy, *more = group.split()
+    if len(more) > 2:
+      raise ValueError
+    opens, *surface = (POSITIVE[0](word, nelem) for word in (energy, *more[1:]))
+    friction = NOT_NEGATIVE[0](more[0], nelem) if more else 0.0
+    found.append(NeedleRow(name, opens, friction, *surface or [opens]))
+  return tuple(found)
+
+
 def words(*values: str) -> tuple:
   """Returns how one of some words is read, and the words for it."""
   return choice({value: value for value in values})

@@ -10,7 +10,7 @@ from scenes import probed
 
 SIZES = {"nfree": 21, "ninner": 6, "nmoving": 27}
 SIZES |= {"nvert": 9, "nslot": 5, "ngeom": 3, "most": 7}
-SIZES |= {"nrelax": 4, "nrest": 6, "nbond": 3, "nblade": 2}
+SIZES |= {"nrelax": 4, "nrest": 6, "nbond": 3, "nblade": 2, "nneedle": 2}
 SIZES |= {"ncorner": 8, "nplace": 10, "nspare": 2, "ncuts": 1}
 BLOCKS = (layout.NodalState, layout.WindowState, layout.Inbox, layout.Outbox)
 

@@ -24,8 +24,10 @@ def state_size(model: int, instance: int) -> int:
   inner = fill.MOST * m.nflexvert if solid else 0
   most = inner + m.nflexvert
   cuts = coupling.cut_sizes(m.nflexelem, most, spare * m.nflexvert, solid)
-  cutters = mjstruct.config(model, instance, "cutters").strip()
-  sizes = cuts | {"nblade": cutters.count(",") + 1 if cutters else 0}
+  sizes = dict(cuts)
+  for name, key in (("nblade", "cutters"), ("nneedle", "needles")):
+    rows = mjstruct.config(model, instance, key).strip()
+    sizes[name] = rows.count(",") + 1 if rows else 0
   if mjstruct.config(model, instance, "window").strip():
     # A window's vertices count as the organ's, which have more numbers than a slot.
     sizes |= {"nvert": most, "nslot": 0, "ngeom": m.ngeom, "nrelax": relaxes * most}

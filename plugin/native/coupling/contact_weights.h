@@ -10,6 +10,8 @@
 
 namespace palpate {
 
+constexpr double OPEN = 1.0;  // gap of contacts that are none [m]
+
 // Where a triangle lies under the flat end of a cylinder: the middle of that part, weighed by how deep
 // it is, as barycentric weights; its gap; and the axis out of that end. MuJoCo names the deepest point,
 // which jumps from corner to corner where a tool lies flat, and at times a way out that is longer.
@@ -155,6 +157,22 @@ PALPATE bool is_mine(const Fields& f, const char* contact) {
   return false;
 }
 
+// Opens the contacts of needles with the tissue that they are in. Done twice it does nothing.
+template <class Fields>
+PALPATE void lift(const Fields& f, Thread, int) {
+  char* const contacts = datum<char*>(f, DATA_CONTACT);
+  const int ncon = datum<int>(f, DATA_NEFC) > 0 ? datum<int>(f, DATA_NCON) : 0;
+  for (int c = 0; c < ncon; ++c) {
+    const char* contact = contacts + (size_t)CONTACT_LENGTH * c;
+    for (int side = 0; side < 2; ++side) {
+      const int flex = side_of(contact, CONTACT_FLEX, side), geom = side_of(contact, CONTACT_GEOM, 1 - side);
+      if (flex < 0 || geom < 0 || !f.lifted.data[f.ngeom * flex + geom]) continue;
+      const Rows rows = rows_of(f, contact);
+      for (int r = 0; r < rows.normals().count; ++r) datum<double*>(f, DATA_EFC_POS)[rows.first + r] = OPEN;
+    }
+  }
+}
+
 // Gives contacts with an organ their rows, and flags that what MuJoCo has computed of them for its dual
 // solvers has to be computed again. Done twice it does nothing.
 template <class Fields>
@@ -190,6 +208,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
     }
     keep_closed(f, contact, rows, off);
   }
+  lift(f, {}, 0);
   const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
                         (f.enableflags.data[0] & ENABLE_DIAGEXACT);
   f.flags.data[FLAG_WEIGHED] = touched && projects;

@@ -62,14 +62,16 @@ struct Place { D3 at, vel; };
 template <class Arrays, class Nodes>
 PALPATE auto moved_by(const Arrays& mj, const Nodes& o, int i) -> decltype(*o.qposadr.data, D3{}) {
   if (o.windowed) return load(o.disp.data + 3 * i);
+  if (i >= o.inner) return load(o.disp.data + 3 * (i - o.inner));
   const int adr = o.qposadr.data[i];
   return adr < 0 ? D3{0.0, 0.0, 0.0} : load(mj.qpos.data + adr) - load(mj.qpos0.data + adr);
 }
 template <class Arrays, class Nodes>
 PALPATE auto goes_by(const Arrays& mj, const Nodes& o, int i) -> decltype(*o.qposadr.data, D3{}) {
-  const int dof = o.windowed ? 0 : o.dofadr.data[i];
-  if (dof < 0) return {0.0, 0.0, 0.0};
-  return load(o.windowed ? o.vel.data + 3 * i : mj.qvel.data + dof);
+  if (o.windowed) return load(o.vel.data + 3 * i);
+  if (i >= o.inner) return load(o.vel.data + 3 * (i - o.inner));
+  const int dof = o.dofadr.data[i];
+  return dof < 0 ? D3{0.0, 0.0, 0.0} : load(mj.qvel.data + dof);
 }
 
 template <class Nodes>

@@ -1,0 +1,333 @@
+"""Needles that go through an organ: puncture, drive, and the holes that hold them.
+
+A needle is a rigid body along an arc, see `palpate.add_needle`. Its tip is pressed on the tissue
+until that gives way, and leaves holes in it, through which it slides; see `forces/needles.h`.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import dataclasses
+import itertools
+from typing import Any
+
+import mujoco
+import numpy as np
+from palpate.tissue.geometry.mesh import Mesh
+from palpate.tissue.types import doubles, ints, struct
+
+from ..engine import contacts
+from ..engine.layout import HOLE, HOLES, NEEDLE, PIERCE
+from ..engine.model import flexes, mjstruct
+from .declare_attachments import find_body, most
+from .host import Bodies, Host, Input, Nodes, kernels
+from .passive import Force
+
+# Stiffness of what ties a needle to a hole, over that of the tissue there.
+_FIRM = 10.0
+# How much farther than they reach contacts with a needle end before a hole, and the least, in a
+# needle's lengths: that of its point.
+_MARGIN, _POINT = 3.0, 0.1
+_ENDS = ("swage", "tip")
+# As in the header.
+_POINTS = HOLES + 1
+_TOUCHING, _INSIDE = 1, 2
+_WITHIN = 1
+
+
+@struct
+class Pierced:
+  """The needles that an organ knows."""
+
+  nneedle: int  # number of them
+  nlisted: int  # their geoms
+  nelem: int  # triangles of the organ
+  ntet: int  # tetrahedra, of a solid
+  ahead: float  # see `Host.fill`
+  gain: float
+  edge: float  # mean length of the mesh's edges [m]
+  body: ints("nneedle")  # its body
+  floats: ints("nneedle")  # whether that is free
+  circle: doubles("nneedle")  # radius of its circle [m]
+  half: doubles("nneedle")  # half the angle of its arc [rad]
+  law: doubles("nworld", "nneedle", len(PIERCE))  # see PIERCE
+  geom: ints("nlisted")  # geoms of needles
+  whose: ints("nlisted")  # of which
+  end: doubles("nlisted")  # where along it they end [m]
+  lifted: ints("nworld", "ngeom")  # whether a geom does not touch the organ
+  mesh: ints("nworld")  # which mesh a world has
+  elem: ints("nmesh", "nelem", 3)  # triangles
+  tet: ints("nmesh", "ntet", 4)  # tetrahedra
+  flat: doubles("nmesh", "nvert", 3)  # rest positions as the cuts have them [m]
+  state: doubles("nworld", "nneedle", len(NEEDLE))  # see NEEDLE
+  next: doubles("nworld", "nneedle", len(NEEDLE))  # what it will be
+  force: doubles("nworld", "nneedle", _POINTS, 3)  # on the tissue, in the organ's frame [N]
+  point: doubles("nworld", "nneedle", _POINTS, 3)  # of the needle, where it acts [m]
+  held: ints("nworld", "nneedle", _POINTS, 4)  # vertices that bear it
+  share: doubles("nworld", "nneedle", _POINTS, 4)  # of each of them
+  hold: doubles("nworld", "nneedle", _POINTS, 6)  # what weighs on the change of velocity there [kg]
+  weight: doubles("nworld", "nneedle")  # what all of them weigh on the needle [kg]
+  own: Nodes
+  solve: Input
+  mj: Bodies
+
+
+_enter, _act, _keep = kernels(
+  "forces/needles.h", Pierced, "enter_needles", "act_needles", "keep_needles"
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pinhole:
+  """Where a needle goes through an organ's surface, or through a point inside of a solid.
+
+  Attributes:
+    needle: name of its body
+    inside: whether it is a point inside of a solid
+    at: place now, in the world [m]                         (3,)
+    rest: the same at rest                                  (3,)
+    along: how far along the needle it is, from the swage [m]
+    force: on the organ in the last step, in the world [N]  (3,)
+  """
+
+  needle: str
+  inside: bool
+  at: np.ndarray
+  rest: np.ndarray
+  along: float
+  force: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Needle:
+  """A needle that an organ knows.
+
+  Attributes:
+    name: of its body
+    touches: whether its tip is pressed on a surface from either side
+    inside: whether its tip is in a solid
+    force: of the whole needle on the organ in the last step, in the world [N]  (3,)
+    tip_force: that of its tip                                                  (3,)
+    energy: that piercing and cutting have taken [J]
+    holes: its pinholes, the first made first
+  """
+
+  name: str
+  touches: bool
+  inside: bool
+  force: np.ndarray
+  tip_force: np.ndarray
+  energy: float
+  holes: tuple[Pinhole, ...]
+
+
+class Needles(Force):
+  """What goes through an organ; false where nothing does.
+
+  Attributes:
+    names: of the needles' bodies
+  """
+
+  KEYS, WORLDS = ("needles",), False
+  ENTER, ACT, END = _enter, _act, _keep
+
+  def __init__(self, host: Host):
+    super().__init__(host)
+    self.count = 1  # a warp a world
+    self.names: list[str] = []
+    self._shape: dict[str, np.ndarray] = {}
+    self._slit = np.zeros(0)  # width of what a tip opens [m]
+    self._margin = np.zeros(0)  # see `PIERCE.margin` [m]
+
+  def __bool__(self) -> bool:
+    return bool(self.names)
+
+  def declare(self):
+    """Finds the needles that the configuration names.
+
+    Raises:
+      ValueError: one does not exist, is no needle, begins in the organ, or is short for its mesh.
+    """
+    host, m = self.host, self.host.m
+    rows = host.config.needles
+    found = [_read(host, row.name) for row in rows]
+    if not found:
+      return
+    radius = float(mjstruct.view(m.flex_radius, m.nflex)[host.organ.flexes[-1]])
+    parts = [part for each in found for part in each["parts"]]
+    body = np.array([each["body"] for each in found])
+    whose = np.repeat(np.arange(len(found)), [len(each["parts"]) for each in found])
+    self._shape = {
+      "body": body,
+      "floats": np.array([_is_free(m, b) for b in body], int),
+      "circle": np.array([each["circle"] for each in found]),
+      "half": np.array([each["half"] for each in found]),
+      "geom": np.array([g for g, _ in parts]),
+      "whose": whose,
+      "end": np.array([end for _, end in parts]),
+    }
+    self._slit = np.array([each["slit"] for each in found])
+    thick = np.array([each["radius"] for each in found])
+    length = 2 * self._shape["half"] * self._shape["circle"]
+    self._margin = np.maximum(_MARGIN * (radius + thick), _POINT * length)
+    self.names = [mjstruct.name_of(m, m.name_bodyadr, int(b)) for b in body]
+    host.need_springs()
+
+  def take(self, declared: "Needles", twin: Any):
+    """See `Force`."""
+    if declared:
+      self.names, self._shape = declared.names, dict(declared._shape)
+      self._slit, self._margin = declared._slit, declared._margin
+      numbers = [self.host.body_number(int(b)) for b in self._shape["body"]]
+      self._shape["body"] = np.array(numbers)
+      self.host.need_springs()
+
+  def _law(self) -> np.ndarray:
+    """Returns the rows of `Pierced.law`."""
+    host, config = self.host, self.host.config
+    m, out = host.m, np.zeros((len(self.names), len(PIERCE)))
+    asked = contacts.tissue_of(m, host.organ, config)[..., contacts.TISSUE.asked]
+    stiffness = contacts.FIRM / (np.mean(asked) * (contacts.SLOW * float(m.opt.timestep)) ** 2)
+    bodies = [find_body(host, "needles", row.name) for row in config.needles]
+    for k, row in enumerate(config.needles):
+      free = bool(self._shape["floats"][k])
+      out[k, PIERCE.force] = row.energy * self._slit[k]
+      out[k, PIERCE.surface] = row.surface * self._slit[k]
+      out[k, PIERCE.friction] = row.friction
+      out[k, PIERCE.stiffness] = min(_FIRM * stiffness, np.inf if free else most(host, bodies[k]))
+      out[k, PIERCE.wall] = 0.0 if config.elements == "solid" else config.thickness
+      out[k, PIERCE.clear] = self._slit[k]
+      out[k, PIERCE.margin] = self._margin[k]
+    return out
+
+  @property
+  def aims(self) -> bool:
+    """See `Force`."""
+    return bool(self)
+
+  def bind(self):
+    """See `Force`."""
+    if not self:
+      return
+    host, n = self.host, len(self.names)
+    widths = {"force": 3, "point": 3, "share": 4, "hold": 6}
+    values: dict[str, Any] = {name: host.zeros(n, _POINTS, w) for name, w in widths.items()}
+    values |= self._shape | host.surface() | dict(
+      nneedle=n,
+      nlisted=len(self._shape["geom"]),
+      edge=float(host.organ.mesh.whole.edge_length),
+      law=np.tile(self._law(), (host.nworld, 1, 1)),
+      lifted=host.lifted(),
+      state=host.rows("needle", len(NEEDLE)),
+      next=host.zeros(n, len(NEEDLE)),
+      held=host.zeros(n, _POINTS, 4, dtype=int),
+      weight=host.zeros(n),
+    )  # fmt: skip
+    self.fields = host.fill(Pierced, values, into=self.fields)
+
+  def refresh(self):
+    """Takes the material that there is now."""
+    if self.fields is not None:
+      self.fields.law.assign(np.tile(self._law(), (self.host.nworld, 1, 1)))
+
+  def read(self, x: np.ndarray) -> list[Needle]:
+    """Returns what the needles do, of one world, with vertices at places [m], (nvert, 3)."""
+    if not self:
+      return []
+    organ, out = self.host.organ, []
+    mesh, turn = organ.mesh, organ.frame.T
+    rest = organ.origin + mesh.rest @ turn
+    force = self.fields.force.numpy()[0] @ turn
+    state = self.fields.state.numpy()[0]
+    for k, (name, row) in enumerate(zip(self.names, state, strict=True)):
+      holes = []
+      for h in range(int(row[NEEDLE.count])):
+        hole = row[NEEDLE.hole + len(HOLE) * h :]
+        vert, share = _corners(mesh, hole)
+        at = share @ x[vert]
+        along = self._along(k, at)
+        within = bool(hole[HOLE.kind] == _WITHIN)
+        holes.append(Pinhole(name, within, at, share @ rest[vert], along, force[k, h]))
+      stage, energy = row[[NEEDLE.stage, NEEDLE.work]]
+      whole, tip = force[k].sum(axis=0), force[k, HOLES]
+      told = stage == _TOUCHING, stage == _INSIDE, whole, tip, float(energy), tuple(holes)
+      out.append(Needle(name, *told))
+    return out
+
+  def _along(self, k: int, at: np.ndarray) -> float:
+    """Returns how far along a needle the point is that is nearest to a place [m]."""
+    turn, origin = self.host.body_frame(int(self._shape["body"][k]))
+    x, y, _ = (at - origin) @ turn
+    half, circle = self._shape["half"][k], self._shape["circle"][k]
+    return float((np.arctan2(y, x) + half) * circle)
+
+
+def _corners(mesh: Mesh, hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the vertices of a hole's triangle or tetrahedron, and their shares."""
+  elem, share = int(hole[HOLE.elem]), hole[HOLE.elem + 1 : HOLE.elem + 4]
+  if hole[HOLE.kind] != _WITHIN:
+    return mesh.elem[elem], np.array([1 - share[:2].sum(), *share[:2]])
+  return mesh.tet[elem], np.array([1 - share.sum(), *share])
+
+
+def _is_free(m, body: int) -> bool:
+  joint = mjstruct.view(m.body_jntadr, m.nbody, np.int32)[body]
+  kind = mjstruct.view(m.jnt_type, m.njnt, np.int32)
+  return joint >= 0 and kind[joint] == int(mujoco.mjtJoint.mjJNT_FREE)
+
+
+def _read(host: Host, name: str) -> dict[str, Any]:
+  """Returns the arc, the tip and the geoms of a needle."""
+  m, organ = host.m, host.organ
+  body = find_body(host, "needles", name)
+  mine = np.flatnonzero(mjstruct.view(m.site_bodyid, m.nsite, np.int32) == body)
+  sites = {mjstruct.name_of(m, m.name_siteadr, int(site)): site for site in mine}
+  ends = [next((sites[s] for s in sites if s.endswith(f"_{end}")), None) for end in _ENDS]
+  geoms = np.flatnonzero(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32) == body)
+  at = mjstruct.view(m.site_pos, (m.nsite, 3))
+  if None in ends or not len(geoms):
+    raise ValueError(
+      f"organ {organ.name!r}: needles names {name!r}, which has no geoms or no sites '_swage' and "
+      "'_tip', expected a body that `palpate.add_needle` has made"
+    )
+  tip = at[ends[1]]
+  circle, half = float(np.hypot(*tip[:2])), float(np.arctan2(tip[1], tip[0]))
+  size = mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms]
+  middle = mjstruct.view(m.geom_pos, (m.ngeom, 3))[geoms]
+  place = (np.arctan2(middle[:, 1], middle[:, 0]) + half) * circle
+  edge = organ.mesh.whole.edge_length
+  if edge > circle:
+    raise ValueError(
+      f"organ {organ.name!r}: its edges are {1e3 * edge:.3g} mm long in the mean, too long for a "
+      f"bite of needle {name!r}, expected at most its radius, {1e3 * circle:.3g} mm"
+    )
+  turn, origin = flexes.body_frame(m, body)
+  angle = np.linspace(-half, half, 17)
+  arc = origin + circle * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]) @ turn.T
+  if _goes_through((arc - organ.origin) @ organ.frame, organ.mesh):
+    raise ValueError(f"organ {organ.name!r}: needle {name!r} begins in it, expected one outside")
+  return {
+    "body": body, "circle": circle, "half": half, "radius": float(size[:, 0].max()),
+    "slit": 2 * float(mjstruct.view(m.site_size, (m.nsite, 3))[ends[1], 0]),
+    "parts": list(zip(geoms.tolist(), (place + size[:, 1]).tolist(), strict=True)),
+  }  # fmt: skip
+
+
+def _goes_through(line: np.ndarray, mesh: Mesh) -> bool:
+  """Returns whether a line through points [m], (n, 3), goes through a surface or is inside."""
+  x = mesh.rest[mesh.elem]
+  e, g = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
+  for start, stop in itertools.pairwise(line):
+    way, r = stop - start, start - x[:, 0]
+    p, q = np.cross(way, g), np.cross(r, e)
+    det = (e * p).sum(axis=1)
+    det = np.where(np.abs(det) > 0, det, np.inf)
+    v, w, t = (r * p).sum(axis=1) / det, (q @ way) / det, (g * q).sum(axis=1) / det
+    if ((v >= 0) & (w >= 0) & (v + w <= 1) & (t >= 0) & (t <= 1)).any():
+      return True
+  if not mesh.closed:
+    return False
+  a, b, c = np.moveaxis(x - line[0], 1, 0)  # solid angle (van Oosterom and Strackee 1983)
+  la, lb, lc = (np.linalg.norm(each, axis=1) for each in (a, b, c))
+  dots = (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+  angle = 2 * np.arctan2((a * np.cross(b, c)).sum(axis=1), la * lb * lc + dots).sum()
+  return abs(angle) > 2 * np.pi

@@ -1,0 +1,424 @@
+// Needles through an organ. A needle is an arc of a circle, rigid and free or held by MuJoCo's bodies; what it goes
+// through are points of the tissue, its holes, tied to the nearest points of the arc. Doubles; on the CPU beside
+// MuJoCo, on CUDA a warp a world, whose threads do all the same but for looking at triangles and tetrahedra.
+//
+// With G the energy that it takes to open an area and b the width of the slit that the tip opens, tissue bears the
+// tip up to G b along the needle, and there its seat goes on through the tissue as far as brings its spring back to
+// that: a return mapping, which takes G b of energy a length whatever the step and the speed (tearing; Barnett et al.
+// 2015, doi:10.1115/1.4030374). The surface of a solid may bear more: the force rises to a peak where the tip comes
+// in, and to a second where it leaves (Frick et al. 2001, doi:10.1016/S0021-9290(01)00099-9). A sheet is pierced over
+// its thickness. Holes are held across the needle; along it each is dragged by friction, a force by length of the
+// needle in tissue (Okamura et al. 2004, doi:10.1109/TBME.2004.831542), that sticks or slips.
+//
+// Both ends are implicit. The tissue has the springs in its matrix and takes the needle to move on as it does, the
+// needle their part of its inertia in MuJoCo's: each end alone, which is stable whatever either weighs (for two
+// points, stiffness and masses over five decades, no mode of the pair grows).
+//
+// Places are in the organ's frame, places along a needle from its swage.
+#pragma once
+#include "cutting/blade_anchor.h"
+
+namespace palpate {
+
+enum { AWAY, TOUCHING, INSIDE };      // stages of a tip
+enum { INTO, WITHIN, OUT, THROUGH };  // holes: into a solid, in it, out of it; through a sheet
+
+constexpr int POINTS = HOLES + 1;  // that hold a needle; the last is its tip
+// Shares of a needle's length: of its end that looks for tissue, and from a hole that it has just made.
+constexpr double POINT = 0.1, CLEAR = 0.04;
+constexpr double SKIDS = 2.0;   // times its way along a needle that a tip is off its seat before it lets go
+constexpr double BELOW = 0.02;  // edges under the surface where a tip is in a solid
+constexpr double TIGHT = 1e-9;  // of what tissue bears, to which a return mapping brings it
+constexpr double APART = 0.5;   // edges between holes in a solid, at least
+
+template <class Fields>
+PALPATE Fields of_world(Fields f, int world) {
+  move_bodies(f.mj, world);
+  move_nodes(f.own, world);
+  move_input(f.solve, world);
+  move_each(world, f.state, f.next, f.law, f.force, f.point, f.share, f.held, f.hold, f.weight, f.lifted);
+  move_to(f.mj.M, world);
+  move_to(f.elem, f.mesh.data[world]), move_to(f.tet, f.mesh.data[world]);
+  move_to(f.flat, f.mesh.data[world]);
+  return f;
+}
+
+// A needle where it is now.
+struct Arc {
+  D3 at, x, y;
+  double circle, half, length;
+
+  PALPATE double angle(double s) const { return (2.0 * s / length - 1.0) * half; }
+  PALPATE D3 place(double s) const { return at + circle * (cos(angle(s)) * x + sin(angle(s)) * y); }
+  PALPATE D3 along(double s) const { return cos(angle(s)) * y - sin(angle(s)) * x; }
+  PALPATE double nearest(D3 p) const {
+    return 0.5 * length * (1.0 + atan2(dot(p - at, y), dot(p - at, x)) / half);
+  }
+};
+
+template <class Fields>
+PALPATE Arc arc_of(const Fields& f, int i) {
+  const int b = f.body.data[i];
+  const auto* R = f.mj.xmat.data + 9 * b;
+  const D3 zero = {0.0, 0.0, 0.0};
+  const double* frame = f.own.frame.data;
+  const double circle = f.circle.data[i], half = f.half.data[i];
+  return {add_turned(zero, frame, load(f.mj.xpos.data + 3 * b) - load(f.own.origin.data)),
+          add_turned(zero, frame, {R[0], R[3], R[6]}), add_turned(zero, frame, {R[1], R[4], R[7]}),
+          circle, half, 2.0 * half * circle};
+}
+
+PALPATE D3 in_world(const double* frame, const double* origin, D3 p) { return load(origin) + turned(frame, p); }
+
+template <class Fields>
+PALPATE D3 velocity_of(const Fields& f, int b, const Twist& moving, D3 p) {
+  const D3 arm = arm_of(f.mj, b, in_world(f.own.frame.data, f.own.origin.data, p));
+  return add_turned({0.0, 0.0, 0.0}, f.own.frame.data, velocity_at(moving, arm));
+}
+
+// A point of the tissue: corners of a triangle or a tetrahedron, their shares, place and velocity.
+struct Seat { int count, vert[4]; double share[4]; D3 at, vel; };
+
+template <class Fields>
+PALPATE Seat seat_of(const Fields& f, const double* elem, bool inside) {
+  Seat out = {inside ? 4 : 3, {}, {}, {0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}};
+  const int* corner = inside ? f.tet.data + 4 * (int)elem[0] : f.elem.data + 3 * (int)elem[0];
+  out.share[0] = 1.0;
+  for (int c = 1; c < out.count; ++c) out.share[0] -= out.share[c] = elem[c];
+  for (int c = 0; c < out.count; ++c) {
+    const int v = out.vert[c] = corner[c];
+    out.at += out.share[c] * (load(f.own.rest.data + 3 * v) + moved_by(f.mj, f.own, v));
+    out.vel += out.share[c] * load_lane(f.solve.vel.data + offset_of(f.solve.node.data[v]));
+  }
+  return out;
+}
+
+PALPATE void put_seat(double* elem, int which, D3 shares) {
+  elem[0] = which;
+  store(elem + 1, shares);
+}
+
+PALPATE double* hole(double* s, int h) { return s + NEEDLE_HOLE + HOLE_LENGTH * h; }
+PALPATE int kind_of(double* s, int h) { return (int)hole(s, h)[HOLE_KIND]; }
+PALPATE bool in_solid(int kind) { return kind == INTO || kind == WITHIN; }
+
+// Whether the needle is in the tissue from its last hole on.
+PALPATE bool goes_in(double* s) {
+  const int count = (int)s[NEEDLE_COUNT];
+  return count > 0 && in_solid(kind_of(s, count - 1));
+}
+
+template <class Fields>
+PALPATE Seat seat_of_hole(const Fields& f, double* s, int h) {
+  return seat_of(f, hole(s, h) + HOLE_ELEM, kind_of(s, h) == WITHIN);
+}
+
+template <class Fields>
+PALPATE double place_of_hole(const Fields& f, const Arc& arc, double* s, int h) {
+  return arc.nearest(seat_of_hole(f, s, h).at);
+}
+
+// Makes a hole at the tip's seat.
+PALPATE void make_hole(double* s, int kind, double place) {
+  const int count = (int)s[NEEDLE_COUNT];
+  double* made = hole(s, count);
+  made[HOLE_KIND] = kind;
+  made[HOLE_SLIP] = place;
+  for (int c = 0; c < 4; ++c) made[HOLE_ELEM + c] = s[NEEDLE_ELEM + c];
+  s[NEEDLE_COUNT] = count + 1;
+}
+
+// Closes holes that the tip has been drawn out of, and lets go of those that the swage has left.
+template <class Fields>
+PALPATE void close_holes(const Fields& f, const Arc& arc, double* s) {
+  int count = (int)s[NEEDLE_COUNT], gone = 0;
+  while (count > 0 && place_of_hole(f, arc, s, count - 1) > arc.length) --count;
+  while (gone < count && place_of_hole(f, arc, s, gone) < 0.0) ++gone;
+  for (int c = 0; c < HOLE_LENGTH * (count - gone); ++c) hole(s, 0)[c] = hole(s, gone)[c];
+  s[NEEDLE_COUNT] = count - gone;
+}
+
+// Finds the triangle that a line goes through, nearest to its end; one whose normal is along the line by `facing`
+// (1 along, -1 against, 0 either).
+template <class Fields>
+PALPATE bool find_triangle(const Fields& f, Thread me, const Line& s, int facing, int& elem, D3& weight) {
+  const D3 half = (0.5 * s.length) * s.along, middle = s.from + half, reach = vabs(half), zero = {0.0, 0.0, 0.0};
+  double least = NOWHERE;
+  for (int t = me.tid; t < f.nelem; t += me.nthread) {
+    D3 x[3], w;
+    corners_now(f, t, x);
+    const D3 low = zero - vmax(vmax(zero - x[0], zero - x[1]), zero - x[2]);
+    const D3 high = vmax(vmax(x[0], x[1]), x[2]), off = vmax(low - middle, middle - high) - reach;
+    if (off.x > 0.0 || off.y > 0.0 || off.z > 0.0) continue;
+    if (facing * dot(cross(x[1] - x[0], x[2] - x[0]), s.along) < 0.0) continue;
+    const double at = crossing(s, x, w);
+    if (at < 0.0 || s.length - at >= least) continue;
+    least = s.length - at, elem = t, weight = w;
+  }
+  agree(least, elem, weight);
+  return least < NOWHERE;
+}
+
+// Puts the tip of a needle that goes through the surface on its seat there.
+template <class Fields>
+PALPATE void touch(const Fields& f, Thread t, int i, const Arc& arc, D3 fast, double* s) {
+  const D3 along = arc.along(arc.length);
+  const int count = (int)s[NEEDLE_COUNT];
+  double back = POINT * arc.length + f.mj.timestep.data[0] * norm(fast);
+  if (count) {
+    const double clear = arc.length - place_of_hole(f, arc, s, count - 1) - CLEAR * arc.length;
+    back = clear < back ? clear : back;
+  }
+  int elem = 0;
+  D3 w;
+  if (back <= 0.0 || !find_triangle(f, t, {arc.place(arc.length) - back * along, along, back}, f.ntet ? -1 : 0, elem, w))
+    return;
+  s[NEEDLE_STAGE] = TOUCHING;
+  s[NEEDLE_DEPTH] = 0.0;
+  put_seat(s + NEEDLE_ELEM, elem, {w.y, w.z, 0.0});
+}
+
+// Puts the seat of a tip in a solid on a place; returns whether that is in it.
+template <class Fields>
+PALPATE bool sit_inside(const Fields& f, Thread t, D3 place, double* s) {
+  int tet = 0;
+  D3 w;
+  if (!find_tet(f, t, place, tet, w)) return false;
+  put_seat(s + NEEDLE_ELEM, tet, w);
+  s[NEEDLE_STAGE] = INSIDE;
+  return true;
+}
+
+// What the tissue bears of a tip.
+template <class Fields>
+PALPATE double borne(const Fields& f, const double* law, const double* s) {
+  return s[NEEDLE_STAGE] == TOUCHING && f.ntet ? law[PIERCE_SURFACE] : law[PIERCE_FORCE];
+}
+
+// A tip at a surface: it goes, or pierces it.
+template <class Fields>
+PALPATE void press(const Fields& f, Thread t, int i, const Arc& arc, double* s) {
+  const double* law = f.law.data + PIERCE_LENGTH * i;
+  D3 x[3];
+  corners_now(f, (int)s[NEEDLE_ELEM], x);
+  const Seat seat = seat_of(f, s + NEEDLE_ELEM, false);
+  const D3 along = arc.along(arc.length), pull = arc.place(arc.length) - seat.at;
+  const bool leaves = f.ntet && dot(cross(x[1] - x[0], x[2] - x[0]), along) > 0.0;
+  const double ahead = dot(pull, along), aside = norm(across(pull, along)), bears = borne(f, law, s);
+  if (leaves ? ahead < 0.0 || !goes_in(s) : ahead < 0.0 || aside > SKIDS * (ahead + law[PIERCE_CLEAR])) {
+    s[NEEDLE_STAGE] = AWAY;
+    if (leaves && goes_in(s)) sit_inside(f, t, arc.place(arc.length), s);
+    return;
+  }
+  const double over = ahead - s[NEEDLE_DEPTH] - bears / law[PIERCE_STIFFNESS];
+  if (!(over > 0.0) || s[NEEDLE_COUNT] >= HOLES) return;
+  if (!f.ntet) {
+    const double left = law[PIERCE_WALL] - s[NEEDLE_DEPTH], goes = over < left ? over : left;
+    s[NEEDLE_DEPTH] += goes;
+    s[NEEDLE_WORK] += bears * goes;
+    if (goes < left) return;
+  }
+  const double place = arc.nearest(seat.at);
+  make_hole(s, !f.ntet ? THROUGH : leaves ? OUT : INTO, place);
+  s[NEEDLE_STAGE] = AWAY;
+  if (f.ntet && !leaves && !sit_inside(f, t, seat.at + (BELOW * f.edge) * along, s)) {
+    s[NEEDLE_COUNT] -= 1.0;  // along a face: later
+    s[NEEDLE_STAGE] = TOUCHING;
+  }
+}
+
+// A tip in a solid cuts its way, and leaves holes behind.
+template <class Fields>
+PALPATE void cut_way(const Fields& f, Thread t, int i, const Arc& arc, double* s) {
+  const double* law = f.law.data + PIERCE_LENGTH * i;
+  const D3 along = arc.along(arc.length);
+  const Seat seat = seat_of(f, s + NEEDLE_ELEM, true);
+  const double ahead = dot(arc.place(arc.length) - seat.at, along), slack = law[PIERCE_FORCE] / law[PIERCE_STIFFNESS];
+  const double goes = ahead < 0.0 ? ahead : ahead > slack ? ahead - slack : 0.0;
+  const int count = (int)s[NEEDLE_COUNT];
+  const bool room = count + 2 < HOLES;  // for where it leaves
+  if (room && arc.nearest(seat.at) - place_of_hole(f, arc, s, count - 1) > APART * f.edge)
+    make_hole(s, WITHIN, arc.nearest(seat.at));
+  if (goes == 0.0) return;
+  if (sit_inside(f, t, seat.at + goes * along, s)) {
+    if (goes > 0.0) s[NEEDLE_WORK] += law[PIERCE_FORCE] * goes;
+    return;
+  }
+  int elem = 0;
+  D3 w;
+  const double far = ahead + BELOW * f.edge;  // past what is crushed
+  if (goes < 0.0 || !find_triangle(f, t, {seat.at, along, far}, 1, elem, w)) return;
+  s[NEEDLE_STAGE] = TOUCHING;
+  s[NEEDLE_DEPTH] = 0.0;
+  put_seat(s + NEEDLE_ELEM, elem, {w.y, w.z, 0.0});
+}
+
+// Adds a force on a point of tissue, at a place of the needle, that falls by `hold` dv / h in the step.
+template <class Fields>
+PALPATE void tie(const Fields& f, Thread t, int at, const Seat& seat, D3 place, D3 force, const Sym& hold) {
+  if (t.tid > 0) return;
+  store(f.force.data + 3 * at, force);
+  store(f.point.data + 3 * at, place);
+  const double entries[6] = {hold.xx, hold.xy, hold.xz, hold.yy, hold.yz, hold.zz};
+  for (int c = 0; c < 6; ++c) f.hold.data[6 * at + c] = entries[c];
+  for (int c = 0; c < seat.count; ++c) {
+    f.held.data[4 * at + c] = seat.vert[c];
+    f.share.data[4 * at + c] = seat.share[c];
+    push_node(f.solve, f.solve.node.data[seat.vert[c]], seat.share[c] * force, seat.share[c] * hold);
+  }
+}
+
+// The matrix a (1 - n n^T) + b n n^T.
+PALPATE Sym across_and_along(double a, double b, D3 n) {
+  const double c = b - a;
+  return {a + c * n.x * n.x, c * n.x * n.y, c * n.x * n.z, a + c * n.y * n.y, c * n.y * n.z, a + c * n.z * n.z};
+}
+
+// Ties a needle to its holes and its tip to its seat. What has slipped, as the step begins, bears a constant force,
+// so that it does not hang on speed.
+template <class Fields>
+PALPATE void tie_needle(const Fields& f, Thread t, int i, const Arc& arc, const Twist& moving, double* s) {
+  const double* law = f.law.data + PIERCE_LENGTH * i;
+  // Without the tissue's damping, by which the stretch that a step leaves would not tell its force.
+  const double h = f.mj.timestep.data[0], reach = f.ahead * h;
+  const double k = law[PIERCE_STIFFNESS], weight = k * f.gain * h * h;
+  const int count = (int)s[NEEDLE_COUNT], b = f.body.data[i];
+  double before = 0.0;  // the last hole's place
+  for (int n = 0; n < count; ++n) {
+    const Seat seat = seat_of_hole(f, s, n);
+    const double place = arc.nearest(seat.at);
+    // Half the way to each neighbour with tissue between; all of it to the tip.
+    const bool from = n > 0 && in_solid(kind_of(s, n - 1)), on = in_solid(kind_of(s, n));
+    const double next = n + 1 < count ? place_of_hole(f, arc, s, n + 1) : 2.0 * arc.length - place;
+    double length = kind_of(s, n) == THROUGH ? law[PIERCE_WALL] : 0.0;
+    length += (from ? 0.5 * fabs(place - before) : 0.0) + (on ? 0.5 * fabs(next - place) : 0.0);
+    before = place;
+    const D3 along = arc.along(place), at = arc.place(place);
+    const D3 rel = velocity_of(f, b, moving, at) - seat.vel;
+    const double most = law[PIERCE_FRICTION] * length;
+    double& slip = hole(s, n)[HOLE_SLIP];
+    const double slack = most / k, off = slip - place;
+    const bool slips = fabs(off) > slack;
+    if (slips) slip = place + (off > 0.0 ? slack : -slack);
+    const double drags = k * (slip - place + (slips ? 0.0 : reach * dot(rel, along)));
+    const D3 force = k * across(at - seat.at + reach * rel, along) + drags * along;
+    tie(f, t, POINTS * i + n, seat, at, force, across_and_along(weight, slips ? 0.0 : weight, along));
+  }
+  int ties = count;
+  if (s[NEEDLE_STAGE] != AWAY) {
+    const bool inside = s[NEEDLE_STAGE] == INSIDE;
+    const Seat seat = seat_of(f, s + NEEDLE_ELEM, inside);
+    const D3 along = arc.along(arc.length), at = arc.place(arc.length);
+    const D3 rel = velocity_of(f, b, moving, at) - seat.vel;
+    const double bears = borne(f, law, s), press = k * (dot(at - seat.at, along) - (inside ? 0.0 : s[NEEDLE_DEPTH]));
+    const bool sticks = press > 0.0 && press < bears - TIGHT * bears;
+    const double axial = sticks ? press + k * reach * dot(rel, along) : press > 0.0 ? bears : 0.0;
+    const D3 force = k * across(at - seat.at + reach * rel, along) + axial * along;
+    tie(f, t, POINTS * i + HOLES, seat, at, force, across_and_along(weight, sticks ? weight : 0.0, along));
+    ++ties;
+  }
+  if (t.tid > 0) return;
+  f.weight.data[i] = ties * weight;
+  if (ties) f.solve.quiet.data[0] = 0.0;
+}
+
+// Says which of a needle's geoms do not touch the organ: those from a little before its first hole on, or its point.
+template <class Fields>
+PALPATE void lift_contacts(const Fields& f, int i, const Arc& arc, double* s) {
+  double low = arc.length;
+  for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
+    const double place = place_of_hole(f, arc, s, n);
+    low = place < low ? place : low;
+  }
+  low -= f.law.data[PIERCE_LENGTH * i + PIERCE_MARGIN];
+  for (int g = 0; g < f.nlisted; ++g)
+    if (f.whose.data[g] == i) f.lifted.data[f.geom.data[g]] = f.end.data[g] > low;
+}
+
+template <class Fields>
+PALPATE void enter_needles(const Fields& given, Thread t, int) {
+  const Fields f = of_world(given, t.world);
+  for (int i = 0; i < f.nneedle; ++i) {
+    double s[NEEDLE_LENGTH];
+    for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
+    for (int c = 4 * POINTS * i; t.tid == 0 && c < 4 * POINTS * (i + 1); ++c) f.share.data[c] = 0.0;
+    const Arc arc = arc_of(f, i);
+    const int b = f.body.data[i];
+    const Twist moving = twist(f.mj, b, false);
+    close_holes(f, arc, s);
+    if (s[NEEDLE_STAGE] == INSIDE && !goes_in(s)) s[NEEDLE_STAGE] = AWAY;
+    if (s[NEEDLE_STAGE] == INSIDE) cut_way(f, t, i, arc, s);
+    if (s[NEEDLE_STAGE] == AWAY) touch(f, t, i, arc, velocity_of(f, b, moving, arc.place(arc.length)), s);
+    if (s[NEEDLE_STAGE] == TOUCHING) press(f, t, i, arc, s);
+    tie_needle(f, t, i, arc, moving, s);
+    if (t.tid > 0) continue;
+    lift_contacts(f, i, arc, s);
+    for (int c = 0; c < NEEDLE_LENGTH; ++c) f.next.data[NEEDLE_LENGTH * i + c] = s[c];
+  }
+}
+
+// Lets MuJoCo's solver meet more inertia at the dofs of a free body: of moving, and of turning about its origin. In
+// mujoco_warp M is factored afterwards.
+template <class Arrays>
+PALPATE void add_inertia(const Arrays& mj, int b, double along, double about) {
+  const int first = mj.body_dofadr.data[b];
+  const auto row = [&](int c) { return mj.M_rowadr.data[first + c]; };
+  const auto last = [&](int c) { return mj.M_rownnz.data[first + c] - 1; };
+  for (int c = 0; c < 6; ++c) mj.M.data[row(c) + last(c)] += c < 3 ? along : about;
+  if constexpr (sizeof(*mj.M.data) == sizeof(double)) {
+    for (int c = 0; c < 6; ++c)
+      for (int k = 0; k <= last(c); ++k) mj.qLD.data[row(c) + k] = mj.M.data[row(c) + k];
+    for (int c = 5; c >= 0; --c) {  // M = L^T D L, as MuJoCo has it
+      double* L = mj.qLD.data + row(c);
+      const double inverse = mj.qLDiagInv.data[first + c] = 1.0 / L[last(c)];
+      for (int j = last(c) - 1; j >= 0; --j) {
+        const int above = c - last(c) + j;
+        for (int k = 0; k <= last(above); ++k) mj.qLD.data[row(above) + k] -= L[j] * inverse * L[k];
+      }
+      for (int j = 0; j < last(c); ++j) L[j] *= inverse;
+    }
+  }
+}
+
+// Ends the forces with what the step made of the tissue's velocities, and lets the needles feel them.
+template <class Fields>
+PALPATE void act_needles(const Fields& given, Thread t, int) {
+  if (t.tid > 0) return;
+  const Fields f = of_world(given, t.world);
+  const bool ok = f.solve.status.data[3] == 0.0f;
+  const D3 zero = {0.0, 0.0, 0.0};
+  const double h = f.mj.timestep.data[0];
+  for (int i = 0; i < f.nneedle; ++i) {
+    const int b = f.body.data[i];
+    D3 sum = zero, torque = zero;
+    for (int at = POINTS * i; at < POINTS * (i + 1); ++at) {
+      D3 dv = zero;
+      double shares = 0.0;
+      for (int c = 4 * at; c < 4 * (at + 1); ++c) {
+        if (f.share.data[c] == 0.0) continue;
+        dv += f.share.data[c] * load_lane(f.solve.dvel.data + offset_of(f.solve.node.data[f.held.data[c]]));
+        shares += f.share.data[c];
+      }
+      const double* p = f.hold.data + 6 * at;
+      const Sym hold = {p[0], p[1], p[2], p[3], p[4], p[5]};
+      const D3 force = ok && shares > 0.0 ? load(f.force.data + 3 * at) - (1.0 / h) * (hold * dv) : zero;
+      store(f.force.data + 3 * at, force);
+      const D3 push = zero - turned(f.own.frame.data, force);
+      sum += push;
+      torque += cross(arm_of(f.mj, b, in_world(f.own.frame.data, f.own.origin.data, load(f.point.data + 3 * at))), push);
+    }
+    push_body(f.mj, b, sum, torque);
+    // |v + w x r|^2 is no more than 2 |v|^2 + 2 r^2 |w|^2.
+    const double weight = 2.0 * f.weight.data[i], r = f.circle.data[i];
+    if (weight > 0.0 && f.floats.data[i]) add_inertia(f.mj, b, weight, weight * r * r);
+  }
+}
+
+// Keeps the needles' state.
+template <class Fields>
+PALPATE void keep_needles(const Fields& given, Thread t, int) {
+  const Fields f = of_world(given, t.world);
+  each_item(t, NEEDLE_LENGTH * f.nneedle, [&](int i) { f.state.data[i] = f.next.data[i]; });
+}
+
+}  // namespace palpate
