@@ -21,6 +21,7 @@ from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
 from palpate.tissue.cutting.topology import Report, pieces
 from palpate.tissue.geometry.mesh import Mesh
+from palpate.tissue.types import fill
 
 from . import bonds, host, kernels, patch
 from .base import Contacts, Tissue, spread
@@ -35,6 +36,7 @@ from .strip_organs import Slots
 if TYPE_CHECKING:
   from palpate.engine.workspace import Workspace
 
+  from .rods import Thread
   from .worlds import Worlds
 
 _WHAT = {"xpos": 0, "xvel": 1, "contact_force": 2}
@@ -74,13 +76,14 @@ class Organ(Tissue):
     w: the plugin's workspace of the organ
     place: where the stripped model has its slots
     tools: geoms that they follow
+    lines: threads that they follow
 
   Attributes:
     host: it, as forces see it
     forces: what acts on it beside its tissue
   """
 
-  def __init__(self, batch: Worlds, w: Workspace, place: Slots, tools: np.ndarray):
+  def __init__(self, batch: Worlds, w: Workspace, place: Slots, tools: np.ndarray, lines: list):
     organ, device, nworld = w.organ, batch.device, batch.nworld
     self.name, self.nvert, self.elem = organ.name, coupling.outer(organ), organ.mesh.elem
     self.declared, self.config, self.space, self.place = organ, organ.config, w, place
@@ -94,10 +97,10 @@ class Organ(Tissue):
     mass = np.ones(self.body.shape.nnode, np.float32)
     mass[node] = np.where(organ.mass > 0, organ.mass, 1.0)  # what waits for a cut has none
     self.body.state.mass.assign(np.tile(order.to_slices(mass), (nworld, 1, 1)))
-    nodal, surface = w.inertia(model._address), patch.Surface(self.body, organ, model, tools)
+    nodal, surface = w.inertia(model._address), patch.Surface(self.body, organ, model, tools, lines)
     if not organ.windows:
       nodal = np.where(organ.free, nodal, proxies.WALL * organ.mass[organ.free].sum())
-    values = patch.constants(self.body, organ, tools, model, nodal, surface)
+    values = patch.constants(self.body, organ, tools, lines, model, nodal, surface)
     values |= patch.variables(nworld, place.nslot, self.body.shape.nslice)
     values |= dict(
       nq=m.nq,
@@ -125,14 +128,29 @@ class Organ(Tissue):
     if organ.mesh.spare:
       self._cuts = Cuts(self, values, surface)
     self.patch = patch.make(values, self.body)
-    self._touch = contacts.make(model, organ, tools, place, self.patch, d)
+    self._touch = contacts.make(model, organ, tools, lines, place, self.patch, d, batch.bare)
     self._pressed = contact_rows.make(self, model, self._touch)
-    self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
-    kinds = frozenset(int(kind) for kind in model.geom_type[tools])
-    self._find = contacts.kernel(kinds)
+    self._convex = convex.make(model, tools, lines, nworld * place.nslot, m, d)
+    kinds = {int(kind) for kind in model.geom_type[tools]} | ({contacts.LINE} if lines else set())
+    self._find, self._lines = contacts.kernel(frozenset(kinds)), []
     self._material = Material(self, batch, self._touch, self._pressed)
     self.host, self._steps = host.Host(self), 0
     self.forces = Forces(self.host, FORCES)
+
+  def follow(self, threads: Sequence[Thread]):
+    """Tells it the threads that its slots follow."""
+    first = 0
+    for thread in threads:
+      f, origin = thread.fields, thread.declared.origin
+      values = {"first": first, "now": f.now, "frame": f.frame, "origin": origin}
+      self._lines.append(fill(contacts.Line, self.body.device, values))
+      first += len(thread.declared.rest) - 1
+
+  def _lay_lines(self):
+    """Writes where the threads' edges are."""
+    for line in self._lines:
+      dim, device = (self.batch.nworld, line.now.shape[1] - 1), self.body.device
+      wp.launch(contacts.lay_lines, dim=dim, inputs=[self.patch, line], device=device)
 
   def enclose(self):
     """Lets the step know volume stiffness and pressure, from the next record on."""
@@ -199,6 +217,7 @@ class Organ(Tissue):
     """Puts the slots on the nodes nearest to the tools and takes the tissue's step."""
     p = self.patch
     self._over(patch.tell_tools, max(1, p.ntool))
+    self._lay_lines()
     self._over(patch.enter, p.nnode)
     if self.body.state.hold.size:
       self.body.state.hold.zero_()
@@ -206,6 +225,10 @@ class Organ(Tissue):
     some = min(p.nnode, _RANKED * p.nslot)  # threads, for as many candidates as there mostly are
     self._over(patch.rank, some)
     self._over(patch.stand, max(some, p.nslot))
+    if self._lines:  # whose steps ask for it
+      dim, device = (self.batch.nworld, p.nslot), self.body.device
+      inputs = [p, self.batch.d.qacc_warmstart]
+      wp.launch(contacts.lead, dim=dim, inputs=inputs, device=device)
     self._scheme.step(self.body)
 
   def touch(self):

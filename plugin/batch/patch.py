@@ -36,7 +36,8 @@ class Patch:
   nnode: int  # nodes
   nslice: int  # slices of nodes
   nslot: int  # slots
-  ntool: int  # geoms that the slots follow
+  ntool: int  # geoms that the slots follow, and after them edges of threads
+  nline: int  # edges of threads
   ngeom: int  # geoms of the model
   nq: int
   nv: int
@@ -64,7 +65,7 @@ class Patch:
   near: ints("nnear")  # triangles of the nodes before the first cut
   frame: doubles(3, 3)  # rotation from the organ's axes to the world's
   origin: doubles(3)  # position of its frame [m]
-  tool_geom: ints("ntool")  # geoms that the slots follow
+  tool_geom: ints("ntool")  # geoms that the slots follow; -1 for edges of threads
   # The organ's mesh, of worlds that are cut their own:
   mesh: ints("nworld")  # which of these a world has
   rest: doubles("nmesh", "nnode", 3)  # rest position [m]
@@ -86,6 +87,8 @@ class Patch:
   before: vector  # the one before it [m/s]
   # Within a step:
   tool: doubles("nworld", "ntool", len(GEOM))  # see GEOM
+  line_xpos: Array(wp.vec3, ("nworld", "nline"))  # of edges of threads, as geom_xpos [m]
+  line_xmat: Array(wp.mat33, ("nworld", "nline"))
   count: ints("nworld")  # candidates
   candidate: ints("nworld", "nnode")  # their nodes
   distance: floats("nworld", "nnode")  # from the nearest tool [m]
@@ -126,7 +129,7 @@ def launch(kernel, patch, nworld: int, count: int, device, arg: int = 0):
 
 
 def constants(
-  body, organ: "Declaration", tools: np.ndarray, model: mujoco.MjModel, met, surface
+  body, organ: "Declaration", tools: np.ndarray, lines: list, model: mujoco.MjModel, met, surface
 ) -> dict:
   """Returns the fields of `Patch` that say what the organ is and which tools it meets.
 
@@ -134,11 +137,13 @@ def constants(
     body: its tissue in all worlds
     organ: its declaration
     tools: geoms that the slots follow
+    lines: threads that they follow
     model: the compiled scene
     met: effective inertia of every vertex [kg]
     surface: makes what follows from a mesh
   """
   mesh, skin = organ.mesh, _skin(organ, model)
+  nline = sum(len(line.rest) - 1 for line in lines)
   own = surface.make(mesh)
   longest = float(own["touch"].max()) * (_LONGER if mesh.spare else 1.0)
   node, nnode = body.shape.node.numpy(), body.shape.nnode
@@ -153,7 +158,10 @@ def constants(
   return dict(
     nnode=nnode,
     nslice=body.shape.nslice,
-    ntool=len(tools),
+    ntool=len(tools) + nline,
+    nline=nline,
+    line_xpos=np.zeros((body.nworld, nline, 3)),
+    line_xmat=np.zeros((body.nworld, nline, 3, 3)),
     ngrade=len(GRADES),
     h=model.opt.timestep,
     rest_share=step.REST,
@@ -170,8 +178,8 @@ def constants(
     near=np.argsort(elem.ravel(), kind="stable") // 3,
     frame=organ.frame,
     origin=organ.origin,
-    tool_geom=tools,
-    tool=np.tile(_tools(tools, model, longest), (body.nworld, 1, 1)),
+    tool_geom=np.append(tools, np.full(nline, -1)),
+    tool=np.tile(_tools(tools, lines, model, longest), (body.nworld, 1, 1)),
   )  # fmt: skip
 
 
@@ -183,12 +191,16 @@ class Surface:
     organ: its declaration
     model: the compiled scene
     tools: geoms that the slots follow
+    lines: threads that they follow
   """
 
-  def __init__(self, body, organ: "Declaration", model: mujoco.MjModel, tools: np.ndarray):
+  def __init__(
+    self, body, organ: "Declaration", model: mujoco.MjModel, tools: np.ndarray, lines: list
+  ):
     self._node, self._nnode = body.shape.node.numpy(), body.shape.nnode
     self._organ = organ
-    self._reach = _skin(organ, model) + float(model.geom_margin[tools].max(initial=0.0))
+    margins = *model.geom_margin[tools], *(model.flex_margin[line.flex] for line in lines)
+    self._reach = _skin(organ, model) + float(max(margins, default=0.0))
     mass = inertia.masses(mjstruct.Model.from_address(model._address), organ)
     if organ.windows:
       self._held = proxies.hold(organ, mass)
@@ -265,8 +277,20 @@ def _longest(mesh, vert: np.ndarray) -> np.ndarray:
   return np.sqrt(np.einsum("ijk,ijk->ij", edge, edge).max(axis=1))
 
 
-def _tools(tools: np.ndarray, model, reach: float) -> np.ndarray:
+def halves(lines: list) -> tuple[np.ndarray, np.ndarray]:
+  """Returns radius and half the length of each edge of threads [m], (nline,)."""
+  half = [0.5 * np.linalg.norm(np.diff(line.rest, axis=0), axis=1) for line in lines]
+  radius = [np.full(len(each), line.radius) for each, line in zip(half, lines, strict=True)]
+  return np.concatenate([[], *radius]), np.concatenate([[], *half])
+
+
+def _tools(tools: np.ndarray, lines: list, model, reach: float) -> np.ndarray:
   """Returns what is the same in all worlds of each tool, see GEOM."""
+  radius, half = halves(lines)
+  line = np.zeros((len(half), len(GEOM)))
+  line[:, GEOM.type] = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+  line[:, GEOM.size], line[:, GEOM.size + 1] = radius, half
+  line[:, GEOM.bound2] = (radius + half + reach) ** 2
   tool = np.zeros((len(tools), len(GEOM)))
   tool[:, GEOM.type] = model.geom_type[tools]
   tool[:, GEOM.size : GEOM.size + 3] = model.geom_size[tools]
@@ -274,7 +298,7 @@ def _tools(tools: np.ndarray, model, reach: float) -> np.ndarray:
   tool[:, GEOM.half : GEOM.half + 3] = model.geom_aabb[tools, 3:]
   bound = model.geom_rbound[tools]
   tool[:, GEOM.bound2] = np.where(bound > 0, (bound + reach) ** 2, _ENDLESS)
-  return tool
+  return np.concatenate([tool, line])
 
 
 def variables(nworld: int, nslot: int, nslice: int) -> dict:

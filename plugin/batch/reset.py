@@ -57,7 +57,9 @@ class Rest:
       zero += [organ.body.state.dvel, organ.patch.stirred]
       zero += [group.arrays["stretch"] for group in organ.forces.of(Bonds).groups]
     for thread in batch.rods.all.values():
-      self.starts += [_start(array) for array in (thread.twist, thread.force)]
+      f = thread.fields
+      self.starts += [_start(f.now, thread.declared.rest)]
+      self.starts += [_start(array) for array in (f.speed, thread.twist, thread.force)]
     self._rows = self.starts + [_start(array) for array in zero if array.size]
     self._move = move = kernels.Move()
     for name in kernels.Move.vars:

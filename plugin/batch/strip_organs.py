@@ -75,13 +75,14 @@ def nodes_under(model, organ: Declaration, tools: np.ndarray) -> np.ndarray:
   return (math.pi * r * r + 2 * r * 2 * (large - middle)) / (math.sqrt(3) / 2 * edge * edge)
 
 
-def slots_for(model, organ: Declaration, tools: np.ndarray, nodes) -> int:
+def slots_for(model, organ: Declaration, tools: np.ndarray, lines: list[int], nodes) -> int:
   """Returns how many slots an organ has.
 
   Args:
     model: the compiled scene
     organ: the organ's declaration
     tools: geoms that the slots follow
+    lines: threads that they follow, which lie on as many nodes as there can be
     nodes: a number, or one by name, or None for what the tools' sizes ask for
   """
   given = nodes.get(organ.name) if isinstance(nodes, dict) else nodes
@@ -91,19 +92,15 @@ def slots_for(model, organ: Declaration, tools: np.ndarray, nodes) -> int:
       raise ValueError(f"organ {organ.name!r}: nodes is {given!r}, expected [{LEAST}, {MOST}]")
     return min(given, nvert)
   many = nodes_under(model, organ, tools).sum()
-  return int(min(np.clip(math.ceil(many), 8, _USUAL), nvert))
+  return int(min(MOST if lines else np.clip(math.ceil(many), 8, _USUAL), nvert))
 
 
-def check_apart(model, organs: list, threads: list):
-  """Raises ValueError where an organ and a thread may touch."""
+def lines_of(model, organ: Declaration, threads: list) -> list[int]:
+  """Returns the numbers of the threads that an organ's slots follow."""
   kind, meets = model.flex_contype, model.flex_conaffinity
-  for organ, thread in itertools.product(organs, threads):
-    a, b = organ.windows.flex if organ.windows else organ.flex, thread.flex
-    if kind[a] & meets[b] or kind[b] & meets[a]:
-      raise ValueError(
-        f"organ {organ.name!r} and thread {thread.name!r} may touch, which a batch on a GPU cannot "
-        "do; expected contype and conaffinity that keep them apart"
-      )
+  a = organ.windows.flex if organ.windows else organ.flex
+  found = [thread.flex for thread in threads]
+  return [k for k, b in enumerate(found) if kind[a] & meets[b] or kind[b] & meets[a]]
 
 
 def _kind(kind: int) -> str:

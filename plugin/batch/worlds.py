@@ -34,6 +34,7 @@ _CONTACTS = 16  # of a world, of tools with each other and with what is fixed
 # Of the constraint solver, at most, and where a tool covers more nodes than there are slots: these
 # share what presses, and 6 iterations threw them about.
 _ITERATIONS, _CROWDED = 6, 20
+_FINE = 1e-11  # tolerance of the constraint solver where there are threads
 _LOST = int(OverflowType.NEFC | OverflowType.NJMAX_NNZ | OverflowType.NARROWPHASE)
 
 
@@ -70,29 +71,33 @@ class Worlds(Batch):
       for number in instances(model, dim=1).values()
     ]
     host.check(spaces.values())
-    strip_organs.check_apart(model, declared, [w.organ for w in sewn])
     tools = [strip_organs.tools_of(model, organ) for organ in declared]
+    threads = [w.organ for w in sewn]
+    lines = [strip_organs.lines_of(model, organ, threads) for organ in declared]
     nslots = [
-      strip_organs.slots_for(model, o, t, nodes) for o, t in zip(declared, tools, strict=True)
+      strip_organs.slots_for(model, *each, nodes)
+      for each in zip(declared, tools, lines, strict=True)
     ]
-    self._crowded = any(
+    self._crowded = any(lines) or any(
       (strip_organs.nodes_under(model, o, t) > n).any()
       for o, t, n in zip(declared, tools, nslots, strict=True)
     )
-    bare, slots = strip_organs.strip(spec, model, declared, nslots, [w.organ for w in sewn])
+    bare, slots = strip_organs.strip(spec, model, declared, nslots, threads)
     self._kept, self.bare = strip_organs.kept(model, declared), bare
     self._graphs: dict[str, tuple[Any, Any]] = {}
     with wp.ScopedDevice(target):
-      self._put(bare, nslots, tools, deterministic, spaces, sewn)
+      self._put(bare, nslots, tools, lines, deterministic, spaces, sewn)
       self._allocate()
       self.bad, self.lost = wp.zeros(nworld, dtype=int), wp.zeros(nworld, dtype=int)
       self.mask = wp.zeros(nworld, dtype=wp.bool)
       self.qpos_out, self.qvel_out = self._arrays["qpos"], self._arrays["qvel"]
       self._organs = {
-        name: Organ(self, w, s, t)
-        for (name, w), s, t in zip(spaces.items(), slots, tools, strict=True)
+        name: Organ(self, w, s, t, [threads[k] for k in found])
+        for (name, w), s, t, found in zip(spaces.items(), slots, tools, lines, strict=True)
       }
       self.rods = rods.Rods(self, sewn)
+      for organ, found in zip(self._organs.values(), lines, strict=True):
+        organ.follow([list(self.rods.all.values())[k] for k in found])
       self.aims = self._join()
       self._rest = Rest(self, bare)
       self._teller = states.Teller(self)
@@ -116,11 +121,11 @@ class Worlds(Batch):
     self._warned = False
     self.reset()
 
-  def _put(self, bare, nslots, tools, deterministic, spaces, sewn):
+  def _put(self, bare, nslots, tools, lines, deterministic, spaces, sewn):
     """Makes mujoco_warp's model and data."""
     model, nworld = self.model, self.nworld
     self.paired = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    most = [contacts.most_of(model, t, n) for t, n in zip(tools, nslots, strict=True)]
+    most = [contacts.most_of(model, *each) for each in zip(tools, lines, nslots, strict=True)]
     condim = int(max([1, *model.flex_condim, *model.geom_condim]))
     each = 1 if condim == 1 else 2 * (condim - 1) if self.paired else condim
     most += [rods.most_contacts(w) for w in sewn]
@@ -158,6 +163,8 @@ class Worlds(Batch):
     # All worlds wait for the one that takes longest.
     most = _CROWDED if self._crowded else _ITERATIONS
     self.m.opt.iterations = min(self.m.opt.iterations, most)
+    if sewn:  # nodes' inertia is a millionth of that of walls, by whose mean it is measured
+      self.m.opt.tolerance.fill_(_FINE)
     ordered = deterministic and not sewn and is_enough(self.m, bare)
     self._order = FixedOrder(self.m, self.d) if ordered else None
     sorted_by_warp = deterministic and not ordered

@@ -7,7 +7,6 @@ import sys
 
 import mujoco
 import numpy as np
-import palpate
 import palpate.batch
 import pytest
 import warp as wp
@@ -56,13 +55,6 @@ def test_a_force_that_is_not_over_rows_of_worlds(monkeypatch):
   monkeypatch.setitem(FORCES, "tide", Tide)  # one that somebody adds, for one world
   with pytest.raises(ValueError, match="organ 'organ': tide is set, which a batch on a GPU cannot"):
     make(press(subdivisions=1))
-
-
-def test_a_thread_that_touches_an_organ():
-  spec = mujoco.MjSpec.from_string(press(subdivisions=1))
-  palpate.add_thread(spec, np.linspace((0, 0, 1), (0.1, 0, 1), 9), "t")
-  with pytest.raises(ValueError, match="organ 'organ' and thread 't' may touch, which a batch"):
-    make(spec)
 
 
 def test_tissues_of_worlds_without_a_gpu_to_step_them():

@@ -10,9 +10,9 @@ from devices import needs_cuda
 DEVICES = ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
 
 
-def scene(text: str, device: str, nworld: int = 2):
-  """Returns the thread of a model and of a batch of it."""
-  spec = mujoco.MjSpec.from_string(text)
+def scene(made, device: str, nworld: int = 2):
+  """Returns a model, its data, its thread, and a batch of it."""
+  spec = made if isinstance(made, mujoco.MjSpec) else mujoco.MjSpec.from_string(made)
   worlds = palpate.batch.make(spec, nworld, device)
   model = spec.compile()
   data = mujoco.MjData(model)
@@ -42,15 +42,19 @@ def off(thread, worlds) -> float:
   return float(np.abs(worlds.thread("t").xpos.numpy() - thread.positions).max())
 
 
+SLOW = pytest.mark.slow
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_hanging_thread_swings_as_under_the_plugin(device):
   model, data, thread, worlds = scene(one.document(one.line(21, 0.04), pin=(0,)), device)
-  run(model, data, worlds, 100)
+  run(model, data, worlds, 60)
   assert off(thread, worlds) < 1e-7
   assert np.abs(data.qvel).max() > 0.5
   np.testing.assert_allclose(worlds.qpos.numpy()[1], data.qpos, atol=1e-7)
 
 
+@SLOW
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_pulled_thread_stretches_by_hooke(device):
   text = one.document(one.line(31, 0.06), pin=(0,), h=0.01, option=one.FREE)
@@ -61,21 +65,38 @@ def test_a_pulled_thread_stretches_by_hooke(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("cone", "kind"), [("pyramidal", "cylinder"), ("elliptic", "capsule")])
+@pytest.mark.parametrize(
+  ("cone", "kind"),
+  [("elliptic", "capsule"), pytest.param("pyramidal", "cylinder", marks=SLOW)],
+)
 def test_a_thread_around_a_drum_obeys_the_capstan_law(device, cone, kind):
   text = one.drum(0.3, cone, kind)
   model, data, thread, worlds = scene(text, device)
   load(model, data, worlds, 0, (0, 0, -0.1))
-  ratio = []
-  for k in range(200):
-    run(model, data, worlds, 1, lambda _, k=k: 0.01 * min(1.0, k / 50))
-    tension = worlds.thread("t").tension.numpy()
-    ratio.append(tension[:, -1] / tension[:, 0])
-  # Not of every step: in single precision pyramids push it aside now and then, by 0.1 mm or so.
-  np.testing.assert_allclose(np.median(ratio[100:], axis=0), np.exp(0.3 * np.pi), rtol=0.03)
-  assert off(thread, worlds) < 4e-4  # it has slid by 1.75 mm
+  run(model, data, worlds, 120, lambda k: 0.01 * min(1.0, k / 30))
+  tension = worlds.thread("t").tension.numpy()
+  np.testing.assert_allclose(tension[:, -1] / tension[:, 0], np.exp(0.3 * np.pi), rtol=0.03)
+  assert off(thread, worlds) < 2e-5  # it has slid by 1 mm
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_thread_over_an_organ_is_borne_by_it(device):
+  """Its weight and two loads are the organ's contact force."""
+  spec = one.draped()
+  model, data, thread, worlds = scene(spec, device)
+  for end in (0, 56):
+    load(model, data, worlds, end, (0, 0, -0.01))
+  run(model, data, worlds, 30)
+  weight = 0.02 + 9.81 * model.body("t_0").mass[0] * 57
+  organ, alone = worlds.organ("ball"), palpate.Organ(model, data, "ball")
+  force = organ.contact_force.numpy()[:, :, 2].sum(axis=1)
+  np.testing.assert_allclose(force, -weight, rtol=0.01)
+  assert np.abs(organ.xpos.numpy() - alone.xpos[: organ.nvert]).max() < 2e-5  # dented by 0.8 mm
+  assert off(thread, worlds) < 5e-4  # of its ends, which swing
+  assert not worlds.overflow.numpy().any()
+
+
+@SLOW
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_needle_swings_on_its_thread(device):
   model, data, thread, worlds = scene(one.needle(1e-3), device)

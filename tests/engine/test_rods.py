@@ -254,8 +254,8 @@ def test_a_thread_comes_to_rest_on_a_floor():
   assert weight == pytest.approx(MASS * 9.81, rel=0.02)  # pyramids share their normal force
 
 
-def test_a_thread_over_an_organ_is_borne_by_it():
-  """Its weight and two loads are the organ's contact force."""
+def draped():
+  """Returns a thread over a soft ball, its ends hanging."""
   spec = mujoco.MjSpec()
   ball, r = trimesh.creation.icosphere(subdivisions=2, radius=0.03), 0.0313
   low = np.flatnonzero(ball.vertices[:, 2] < -0.015)
@@ -266,7 +266,12 @@ def test_a_thread_over_an_organ_is_borne_by_it():
   below = np.abs(s - r * angle)
   points = np.stack([r * np.sin(angle), 0 * s, r * np.cos(angle) - below], axis=1)
   palpate.add_thread(spec, points, "t")
-  model = spec.compile()
+  return spec
+
+
+def test_a_thread_over_an_organ_is_borne_by_it():
+  """Its weight and two loads are the organ's contact force."""
+  model = draped().compile()
   data = mujoco.MjData(model)
   thread, organ = palpate.Thread(model, data, "t"), palpate.Organ(model, data, "ball")
   for end in (0, 56):

@@ -292,6 +292,7 @@ def make(organ: "Organ", model: mujoco.MjModel, touch):
   tools = contacts.LIGHT * model.body_invweight0[model.geom_bodyid, 0]
   out.tools = wp.array(tools, dtype=float, device=device)
   geoms, tool_of = patch.tool_geom.numpy(), np.full(model.ngeom, -1)
+  geoms = geoms[geoms >= 0]
   tool_of[geoms] = np.arange(len(geoms))
   small = np.isin(model.geom_type[geoms], _SMALL).any()
   out.yields = int(tissue[TISSUE.modulus] + tissue[TISSUE.bearing] > 0 and small)

@@ -16,12 +16,13 @@ import warp as wp
 
 # All that depends on names inside of mujoco_warp: its tools against a triangle, and types.
 from palpate.engine import contacts
+from palpate.engine.layout import GEOM
 from palpate.engine.model import mjstruct
-from palpate.tissue.types import Array, fill, floats, ints, struct
+from palpate.tissue.types import Array, doubles, fill, floats, ints, struct
 
 from .. import private
 from ..kernels import triple
-from ..patch import Patch
+from ..patch import Patch, halves
 from ..private import ContactType, vec5
 from . import convex, cylinder
 from .convex import Convex
@@ -41,9 +42,11 @@ _EACH = {
   int(_GEOM.mjGEOM_MESH): 1,
 }
 KINDS = tuple(_EACH)  # of tools that a batch knows
+LINE = int(_GEOM.mjGEOM_LINE)  # an edge of a thread
 _SPHERE, _ELLIPSOID, _CAPSULE, _BOX, _PLANE = (wp.constant(kind) for kind in KINDS[:5])
 _CYLINDER, _MESH = KINDS[5:]
 _FAR = wp.constant(1e10)  # what mujoco_warp says of a contact that is none
+_POS, _AXIS = wp.constant(GEOM.pos), wp.constant(GEOM.axis)
 _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
 _LEAST = 1e-5  # friction, as in MuJoCo
 _HARD = (1.0, 1.0, 1.0, 0.5, 2.0)  # solimp; `sliding` makes contacts as soft as they are
@@ -59,10 +62,13 @@ class Touch:
   """How an organ's triangles touch each tool, and mujoco_warp's contacts."""
 
   most: int  # contacts of a world
+  nline: int  # edges of threads, the last tools
   ring: int  # threads that share the triangles about a slot's node
   flex: int  # the slots' flex
   radius: float  # of that [m]
   kind: ints("ntool")  # mjtGeom
+  line_flex: ints("nline")  # the thread's flex
+  line_elem: ints("nline")  # number of the edge in it
   size: Array(wp.vec3, ("ntool",))  # as geom_size
   margin: floats("ntool")  # [m]
   condim: ints("ntool")
@@ -95,6 +101,16 @@ class Touch:
   out_worldid: ints("naconmax")
   out_type: ints("naconmax")
   out_geomcollisionid: ints("naconmax")
+
+
+@struct
+class Line:
+  """A thread that an organ's slots follow."""
+
+  first: int  # number of its first edge among those of all
+  now: doubles("nworld", "nnode", 3)  # places of nodes in its frame [m]
+  frame: doubles(3, 3)  # rotation from that to the world
+  origin: doubles(3)  # of that [m]
 
 
 @wp.struct
@@ -165,14 +181,79 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
     c.out_solreffriction[k] = wp.vec2(0.0, 0.0)
     c.out_solimp[k] = c.solimp[q]
     c.out_dim[k] = c.condim[q]
-    c.out_geom[k] = wp.vec2i(at.geom, -1)
-    c.out_flex[k] = wp.vec2i(-1, c.flex)
-    c.out_elem[k] = wp.vec2i(-1, at.elem)
+    line = q - (c.kind.shape[0] - c.nline)
+    if line >= 0:
+      c.out_geom[k] = wp.vec2i(-1, -1)
+      c.out_flex[k] = wp.vec2i(c.line_flex[line], c.flex)
+      c.out_elem[k] = wp.vec2i(c.line_elem[line], at.elem)
+    else:
+      c.out_geom[k] = wp.vec2i(at.geom, -1)
+      c.out_flex[k] = wp.vec2i(-1, c.flex)
+      c.out_elem[k] = wp.vec2i(-1, at.elem)
     c.out_vert[k] = wp.vec2i(-1, at.vert)
     c.out_worldid[k] = at.world
     c.out_type[k] = _CONSTRAINT
     c.out_geomcollisionid[k] = n
   return n + 1
+
+
+@wp.func
+def _pose(p: Patch, world: int, tool: int):
+  """Returns where a tool is."""
+  line = tool - (p.ntool - p.nline)
+  if line >= 0:
+    return p.line_xpos[world, line], p.line_xmat[world, line]
+  geom = p.tool_geom[tool]
+  return p.geom_xpos[world, geom], p.geom_xmat[world, geom]
+
+
+@wp.kernel(enable_backward=False)
+def lay_lines(p: Patch, f: Line):
+  """Writes where a thread's edges are."""
+  world, e = wp.tid()
+  a, b = wp.vec3d(), wp.vec3d()
+  for k in range(3):
+    for c in range(3):
+      a[k] += f.frame[k, c] * f.now[world, e, c]
+      b[k] += f.frame[k, c] * f.now[world, e + 1, c]
+  axis = wp.normalize(b - a)
+  side = wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
+  if wp.abs(axis[1]) >= wp.float64(0.5):
+    side = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
+  x = wp.normalize(wp.cross(side, axis))
+  y = wp.cross(axis, x)
+  middle = wp.vec3d(f.origin[0], f.origin[1], f.origin[2]) + wp.float64(0.5) * (a + b)
+  line = f.first + e
+  p.line_xpos[world, line] = wp.vec3(middle)
+  p.line_xmat[world, line] = wp.mat33(wp.matrix_from_cols(x, y, axis))
+  tool = p.ntool - p.nline + line
+  for k in range(3):
+    for c in range(3):
+      turn = p.frame[c, k]
+      if c == 0:
+        p.tool[world, tool, _POS + k] = wp.float64(0.0)
+        for r in range(3):
+          p.tool[world, tool, _AXIS + 3 * r + k] = wp.float64(0.0)
+      p.tool[world, tool, _POS + k] = p.tool[world, tool, _POS + k] + turn * (
+        middle[c] - p.origin[c]
+      )
+      p.tool[world, tool, _AXIS + k] = p.tool[world, tool, _AXIS + k] + turn * x[c]
+      p.tool[world, tool, _AXIS + 3 + k] = p.tool[world, tool, _AXIS + 3 + k] + turn * y[c]
+      p.tool[world, tool, _AXIS + 6 + k] = p.tool[world, tool, _AXIS + 6 + k] + turn * axis[c]
+
+
+@wp.kernel(enable_backward=False)
+def lead(p: Patch, accelerated: wp.array2d[float]):
+  """Gives slots the last acceleration of their nodes."""
+  world, k = wp.tid()
+  i = p.slot_node[world, k]
+  dof = p.dofadr + 3 * k
+  for r in range(3):
+    total = float(0.0)  # noqa: UP018 - a variable to Warp
+    if i >= 0:
+      for c in range(3):
+        total += float(p.frame[r, c] / p.h) * p.last[world, i // 8, c, i % 8]
+    accelerated[world, dof + r] = total
 
 
 @wp.func
@@ -194,6 +275,45 @@ def _ellipsoid(pos: wp.vec3, rot: wp.mat33, size: wp.vec3, a: wp.vec3, b: wp.vec
   return r * (r - 1.0) / wp.max(e, 1e-12), where, rot * wp.normalize(gradient)
 
 
+@wp.func
+def _between(p: wp.vec3, d: wp.vec3, q: wp.vec3, e: wp.vec3):
+  """Returns the nearest points of the segments from p along d and from q along e, and how far."""
+  r = p - q
+  dd, ee, de = wp.dot(d, d), wp.dot(e, e), wp.dot(d, e)
+  dr, er = wp.dot(d, r), wp.dot(e, r)
+  apart = dd * ee - de * de
+  s = float(0.5)  # noqa: UP018 - a variable to Warp
+  if apart > 1e-6 * dd * ee:
+    s = wp.clamp((de * er - dr * ee) / apart, 0.0, 1.0)
+  t = wp.clamp((de * s + er) / ee, 0.0, 1.0)
+  s = wp.clamp((de * t - dr) / dd, 0.0, 1.0)
+  x = p + s * d
+  y = q + t * e
+  return wp.length(y - x), x, y
+
+
+@wp.func
+def _line(
+  pos: wp.vec3, axis: wp.vec3, radius: float, half: float, a: wp.vec3, b: wp.vec3, d: wp.vec3,
+  skin: float, margin: float,
+):  # fmt: skip
+  """Returns distance, place and normal of the point of an edge that is nearest to a triangle."""
+  start = pos - half * axis
+  dist, x, normal = private.sphere_triangle(start, radius, a, b, d, skin, margin)
+  other, y, n = private.sphere_triangle(pos + half * axis, radius, a, b, d, skin, margin)
+  if other < dist:
+    dist, x, normal = other, y, n
+  for k in range(3):
+    corner = wp.where(k == 0, a, wp.where(k == 1, b, d))
+    along = wp.where(k == 0, b, wp.where(k == 1, d, a)) - corner
+    far, here, there = _between(start, 2.0 * half * axis, corner, along)
+    if far - radius - skin < dist and far > 1e-9:
+      dist = far - radius - skin
+      normal = (there - here) / far
+      x = here + (radius + 0.5 * dist) * normal
+  return dist, x, normal
+
+
 @functools.cache
 def _against(kinds: frozenset[int]):
   """Returns the function that finds a triangle's contacts with a tool of one of these kinds."""
@@ -203,8 +323,7 @@ def _against(kinds: frozenset[int]):
 
   @wp.func
   def against(p: Patch, c: Touch, v: Convex, at: Place, n: int, a: wp.vec3, b: wp.vec3, d: wp.vec3):
-    pos = p.geom_xpos[at.world, at.geom]
-    rot = p.geom_xmat[at.world, at.geom]
+    pos, rot = _pose(p, at.world, at.tool)
     size = c.size[at.tool]
     axis = wp.vec3(rot[0, 2], rot[1, 2], rot[2, 2])
     kind = c.kind[at.tool]
@@ -225,6 +344,10 @@ def _against(kinds: frozenset[int]):
         )
         for k in range(5):
           n = _put(c, at, n, dists[k], xs[k], normals[k])
+    if wp.static(LINE in kinds):
+      if kind == wp.static(LINE):
+        near, y5, n5 = _line(pos, axis, size[0], size[1], a, b, d, c.radius, margin)
+        n = _put(c, at, n, near, y5, n5)
     if wp.static(box):
       if kind == _BOX:
         dists2, xs2, normals2 = private.box_triangle(pos, rot, size, a, b, d, c.radius, margin)
@@ -332,8 +455,7 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
           for tool in range(p.ntool):
             at.tool = tool
             at.geom = p.tool_geom[tool]
-            pos = p.geom_xpos[world, at.geom]
-            rot = p.geom_xmat[world, at.geom]
+            pos, rot = _pose(p, world, tool)
             if not convex.is_beyond(v, tool, pos, rot, centre, around + c.radius + c.margin[tool]):
               more = against(p, c, v, at, more, xa, xb, xd)
           if whole:
@@ -371,41 +493,62 @@ def add(c: Touch):
   c.nacon[0] = c.nacon[0] + c.before[last] + c.count[last]
 
 
-def most_of(model: mujoco.MjModel, tools: np.ndarray, nslot: int) -> int:
+def most_of(model: mujoco.MjModel, tools: np.ndarray, lines: list, nslot: int) -> int:
   """Returns how many contacts a world has rows for: two a slot, a patch's triangles, or more."""
   each = max((_EACH[int(kind)] for kind in model.geom_type[tools]), default=1)
-  return nslot * (4 if each > _EACH[int(_GEOM.mjGEOM_CAPSULE)] else 3 if len(tools) > _FEW else 2)
+  many = 4 if each > _EACH[int(_GEOM.mjGEOM_CAPSULE)] else 3 if len(tools) > _FEW else 2
+  return nslot * (many + 4 * bool(lines))
 
 
-def make(model: mujoco.MjModel, organ: "Declaration", tools: np.ndarray, place, patch, data):
+def make(
+  model: mujoco.MjModel,
+  organ: "Declaration",
+  tools: np.ndarray,
+  lines: list,
+  place,
+  patch,
+  data,
+  bare: mujoco.MjModel,
+):
   """Returns how an organ touches its tools.
 
   Args:
     model: the compiled scene
     organ: the organ's declaration
     tools: geoms that its slots follow
+    lines: threads that they follow
     place: where the stripped model has these
     patch: the organ's slots
     data: mujoco_warp's
+    bare: the stripped model
   """
   nworld, nslot, flex = len(patch.missed), place.nslot, place.flex
   # EPA has memory for one triangle of a slot at a time.
   alone = convex.KINDS & set(model.geom_type[tools].tolist())
   ring = 1 if alone else int(np.diff(patch.near_adr.numpy()).max())
   own = organ.flexes[0]
-  rows = [_mix(model, int(g), own) for g in tools]
+  rows = [_mix(model, "geom", int(g), own) for g in tools]
   if not contacts.says(mjstruct.Model.from_address(model._address), own):
     firm = {"solref": (contacts.SLOW * model.opt.timestep, 1.0), "solimp": _HARD}
     rows = [row | firm for row in rows]
+  number = np.array([len(line.rest) - 1 for line in lines], int)
+  for line, count in zip(lines, number, strict=True):
+    rows += [_mix(model, "flex", line.flex, own)] * int(count)
+  radius, half = halves(lines)
+  line_size = np.stack([radius, half, 0 * half], axis=1)
+  flexes = [mujoco.mj_name2id(bare, mujoco.mjtObj.mjOBJ_FLEX, line.name) for line in lines]
   mixed = {name: np.array([row[name] for row in rows]).reshape(-1, *wide)
            for name, wide in _MIXED.items()}  # fmt: skip
   contact = {f"out_{name}": getattr(data.contact, name) for name in _written()}
   values = mixed | contact | dict(
-    most=most_of(model, tools, nslot),
+    most=most_of(model, tools, lines, nslot),
+    nline=len(half),
+    line_flex=np.repeat(flexes, number),
+    line_elem=np.concatenate([[], *map(np.arange, number)]),
     flex=flex,
     radius=float(model.flex_radius[own]),
-    kind=model.geom_type[tools],
-    size=model.geom_size[tools],
+    kind=np.append(model.geom_type[tools], np.full(len(half), LINE)),
+    size=np.concatenate([model.geom_size[tools], line_size]),
     rough=np.full(nworld, model.flex_friction[own, 0]),
     slide=np.tile(mixed["slide"], (nworld, 1)),
     ring=ring,
@@ -423,21 +566,22 @@ def _written() -> list[str]:
   return [name.removeprefix("out_") for name in Touch.vars if name.startswith("out_")]
 
 
-def _mix(model, g: int, f: int) -> dict:
-  """Returns the parameters of a contact of a geom and a flex, as mj_contactParam mixes them."""
-  mine, other = int(model.geom_priority[g]), int(model.flex_priority[f])
-  solref = np.stack([model.geom_solref[g], model.flex_solref[f]])
-  solimp = np.stack([model.geom_solimp[g], model.flex_solimp[f]])
-  friction = np.stack([model.geom_friction[g], model.flex_friction[f]])
-  condim = np.array([model.geom_condim[g], model.flex_condim[f]])
-  margin = float(model.geom_margin[g] + model.flex_margin[f])
+def _mix(model, kind: str, g: int, f: int) -> dict:
+  """Returns the parameters of a contact with a flex, as mj_contactParam mixes them."""
+
+  def both(name: str) -> np.ndarray:
+    return np.stack([getattr(model, f"{kind}_{name}")[g], getattr(model, f"flex_{name}")[f]])
+
+  mine, other = both("priority").tolist()
+  solref, solimp, friction, condim = map(both, ("solref", "solimp", "friction", "condim"))
+  margin = float(both("margin").sum())
   out = {"margin": margin, "slide": friction[0, 0], "whose": int(_GREATER)}
   if mine != other:
     k = int(other > mine)
     parts = condim[k], solref[k], solimp[k], friction[k]
     out["whose"] = int(_ORGAN if k else _TOOL)
   else:
-    a, b = float(model.geom_solmix[g]), float(model.flex_solmix[f])
+    a, b = both("solmix").tolist()
     share = a / (a + b) if a + b > 0 else 0.5
     mixed = share * solref[0] + (1 - share) * solref[1]
     direct = (solref[:, 0] <= 0).any()

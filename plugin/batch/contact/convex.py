@@ -9,6 +9,7 @@ import warp as wp
 # All that depends on names inside of mujoco_warp, with those of `contacts`.
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
+from ..patch import halves
 from ..private import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, Geom, GeomType, ccd
 
 KINDS = {int(mujoco.mjtGeom.mjGEOM_MESH)}
@@ -121,12 +122,13 @@ def touch(k: Convex, t: Before, a: wp.vec3, b: wp.vec3, d: wp.vec3):
   return dist, middle, normal
 
 
-def make(model: mujoco.MjModel, tools: np.ndarray, nthread: int, m, d):
+def make(model: mujoco.MjModel, tools: np.ndarray, lines: list, nthread: int, m, d):
   """Returns the convex tools of an organ.
 
   Args:
     model: the compiled scene
     tools: geoms that the slots follow
+    lines: threads that they follow, which have boxes
     nthread: slots of all worlds
     m: mujoco_warp's model
     d: its data
@@ -138,10 +140,13 @@ def make(model: mujoco.MjModel, tools: np.ndarray, nthread: int, m, d):
   def room(dtype, n):
     return wp.empty((many, n), dtype=dtype, device=d.nacon.device)
 
+  radius, half = halves(lines)
+  box = np.stack([radius, radius, radius + half], axis=1)
+  mesh = np.where(kinds == int(mujoco.mjtGeom.mjGEOM_MESH), model.geom_dataid[tools], -1)
   values = dict(
-    middle=model.geom_aabb[tools, :3],
-    half=model.geom_aabb[tools, 3:],
-    mesh=np.where(kinds == int(mujoco.mjtGeom.mjGEOM_MESH), model.geom_dataid[tools], -1),
+    middle=np.concatenate([model.geom_aabb[tools, :3], 0.0 * box]),
+    half=np.concatenate([model.geom_aabb[tools, 3:], box]),
+    mesh=np.append(mesh, np.full(len(half), -1)),
     vertadr=m.mesh_vertadr,
     vertnum=m.mesh_vertnum,
     graphadr=m.mesh_graphadr,

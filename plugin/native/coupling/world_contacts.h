@@ -48,6 +48,7 @@ template <class Fields>
 PALPATE void find_series(const Fields& f, Thread t, int) {
   each_item(t, f.ntool, [&](int q) {
     const int geom = f.tool_geom.data[q];
+    if (geom < 0) return;  // an edge of a thread
     const size_t g = (size_t)t.world * f.ngeom + geom;
     const double* of = f.tool.data + (size_t)GEOM_LENGTH * (t.world * f.ntool + q);
     const float* R = (const float*)f.geom_xmat.data + 9 * g;

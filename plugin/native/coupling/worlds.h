@@ -102,6 +102,7 @@ PALPATE void tell_tools(const Fields& f, Thread t, int) {
     f.stirred.data[t.world] = 0;
   }
   each_item(t, f.ntool, [&](int q) {
+    if (f.tool_geom.data[q] < 0) return;  // an edge of a thread
     const size_t g = (size_t)t.world * f.ngeom + f.tool_geom.data[q];
     const float* R = (const float*)f.geom_xmat.data + 9 * g;
     const D3 from = load((const float*)f.geom_xpos.data + 3 * g) - load(f.origin.data);
