@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from ..core.environment import Environment
+from ..core.instrument import AXES
 from ..core.performer import Performer, Script
-from ..core.physics import AXES
 from .policy import Policy
 
 SHAKEN, CALM = 25, 50  # control steps that noise lasts, and that follow without
