@@ -3,9 +3,11 @@
 The action has the grasper's components, then those of the hook: `hook_pitch`, `hook_yaw`,
 `hook_roll`, `hook_insertion`, and `hook_current`, which is on above 0.
 
-Own observations: those of `dissect`, and `hook_front` (3,), from the hook's tip to the nearest bond
-that holds [m]; `retracted` (1,), how far the site is from its place at rest, away from the bed, as
-a share of what is needed [-]; `burnt` (1,), share of the burn that is damage [-].
+Own observations: those of `dissect`, and `hook_front` (3,), from the hook's tip to the bond to
+divide next, which was nearest to it when the last one came free [m]; `hook_gap` (1,), how far
+the nearest strand that holds is from the current's reach, negative within it, 2 mm at most [m];
+`retracted` (1,), how far the site is from its place at rest, away from the bed, as a share of what
+is needed [-]; `burnt` (1,), share of the burn that is damage [-].
 
 A current frees the bonds whose strands the hook's wire touches in 0.2 s: a strand goes from the bed
 to the organ and is as thick as its skin, and a spark leaps 0.3 mm to it. What comes free while the
@@ -59,17 +61,19 @@ AWAY = 0.005  # least way of the site from the bed, for what is divided to count
 RATE = 5.0  # damage that the current does to bonds [1/s]
 WIRE = "hook_toe"  # geom of the hook that has it
 TOUCHING, BURN = 0.03, 0.5  # force with which the hook touches [N], time that it may burn [s]
-# Of that time, what is forgotten in a second: a millimetre of tissue cools in d^2 / (4 a), with
-# a = 1.4e-7 m^2/s (Niemz 2007, Laser-Tissue Interactions, 3.2). Hands are late by 0.1 s.
+# Of that time, what is forgotten in a second: a millimetre of tissue cools in d^2 / (4 a), with the
+# a = 1.4e-7 m^2/s of water (van Gemert and Welch 1989, 10.1002/lsm.1900090414; Niemz 2007, Laser-
+# Tissue Interactions, 3.2). Hands are late by 0.1 s.
 COOLING = BURN / (1e-3**2 / (4 * 1.4e-7))
 HOOK_LIMIT, HOOK_DAMAGE = 1.5, 3.0  # of its force, as of other tips without jaws [N]
+ASIDE = 0.002  # how far a strand that is not near is said to be, at most [m]
 SCENE = dataclasses.replace(
   FUNDUS, nodes=250, bonds=BED, second="hook", second_port=(-0.05, -0.01, 0.12)
 )
 # Of the expert: how far it pulls at most [m], how much further than it has to, the share of the
 # largest traction it keeps under, how far above a bond the hook aims and begins [m], and at what
 # share of the reach it stops.
-_FAR, _MORE, _SHARE, OFF, _WAITS, NEAR = 0.03, 0.3, 0.7, 0.0005, 0.01, 0.92
+_FAR, _MORE, _SHARE, OFF, _WAITS, NEAR = 0.03, 0.3, 0.7, 0.0005, 0.01, 0.8
 
 
 @exercise("bimanual/easy", 40, "easy", "bimanual")
@@ -106,7 +110,9 @@ class State(dissect.State):
   time: float  # how long it has burnt what the hook touches, less what has cooled [s]
   powered: float  # how long it was on [s]
   wasted: float  # with no bond in reach [s]
+  aim: int  # bond to divide next
   hook_front: Vector
+  hook_gap: float
   retracted: float
   burnt: float
 
@@ -149,11 +155,25 @@ def _divide(s, o):
   return found > 0
 
 
+def gap(s, o):
+  """Returns how far the nearest strand that holds is from the reach of the wire [m]."""
+  return min(float(distances(s, o).min()) - o.reach, ASIDE)
+
+
+@many(gap)
+def _gap(s, o):
+  least = float(ASIDE)
+  for k in range(bonds(s)):
+    if not is_free(s, k):
+      far = strand_distance(s, k, other_point(s, o.heel), other_point(s, o.toe)) - o.reach
+      least = min(least, far)
+  return least
+
+
 def nearest(s):
-  """Returns where the bond is that holds and is nearest to the hook's tip [m]."""
-  bonds = s.organ.bonds
-  far = np.linalg.norm(bonds.positions - other_tip(s), axis=1)
-  return bonds.positions[np.where(bonds.free, np.inf, far).argmin()]
+  """Returns which bond of those that hold is nearest to the hook's tip."""
+  far = np.linalg.norm(s.organ.bonds.positions - other_tip(s), axis=1)
+  return int(np.where(s.organ.bonds.free, np.inf, far).argmin())
 
 
 @many(nearest)
@@ -164,7 +184,7 @@ def _nearest(s):
     if far < least and not is_free(s, k):
       least = far
       found = k
-  return bond(s, found)
+  return found
 
 
 def act(s, o):
@@ -184,15 +204,18 @@ def advance(s, o):
   """Follows the grasp, what comes free, and what is burnt."""
   o, near = hold(s, o)
   o, outcome = count(s, o, fair(s, o))
+  if is_free(s, o.aim):
+    o.aim = nearest(s)
   if outcome == RUNNING and (o.time > BURN or other_force(s) > HOOK_DAMAGE):
     outcome = DAMAGED
   return o, earned(o, near, outcome), outcome
 
 
 def observe(s, o):
-  """Finds what `dissect` does, hook_front, retracted and burnt."""
+  """Finds what `dissect` does, hook_front, hook_gap, retracted and burnt."""
   o = look(s, o)
-  o.hook_front = nearest(s) - other_tip(s)
+  o.hook_front = bond(s, o.aim) - other_tip(s)
+  o.hook_gap = gap(s, o)
   o.retracted = retraction(s, o) / AWAY
   o.burnt = min(o.time / BURN, 1.0)
   return o
@@ -205,7 +228,7 @@ class Bimanual(Dissect):
     State,
     advance,
     observe,
-    (*Dissect.rules.observed, "hook_front", "retracted", "burnt"),
+    (*Dissect.rules.observed, "hook_front", "hook_gap", "retracted", "burnt"),
     METRICS | {"current_time": "powered", "current_wasted": "wasted"},
     act,
     mark=Dissect.rules.mark,
@@ -228,6 +251,7 @@ class Bimanual(Dissect):
     self.heel, self.toe = (ends - tip.xpos) @ tip.xmat.reshape(3, 3)
     flex = mujoco.mj_name2id(model.ptr, mujoco.mjtObj.mjOBJ_FLEX, physics.organ_name)
     self.reach = float(width + model.flex_radius[flex] + SPARK)
+    self.aim = nearest(physics)
     self.rest = physics.point(self.site)
     away = self.rest - middle(physics)
     self.away = away / np.linalg.norm(away)
@@ -283,15 +307,13 @@ class Bimanual(Dissect):
       if not fair(physics, self):
         yield p.step()
         continue
-      bonds = physics.organ.bonds
-      held = np.flatnonzero(~bonds.free)
-      near = held[np.linalg.norm(bonds.positions[held] - p.tip, axis=1).argmin()]
-      yield from p.above(bonds.positions[near], _WAITS, up)
-      while self.outcome is None and fair(physics, self) and not bonds.free[near]:
-        apart = distances(physics, self)[near] / self.reach
-        p.extra[:] = 1.0 if apart < 1.0 else -1.0
-        if apart > NEAR:
-          step = bonds.positions[near] + OFF * up - p.tip
+      goal, aim = physics.organ.bonds.positions[self.aim], self.aim
+      if distances(physics, self)[aim] > self.reach:
+        yield from p.above(goal, _WAITS, up)
+      while self.outcome is None and fair(physics, self) and aim == self.aim:
+        p.extra[:] = 1.0 if gap(physics, self) < 0.0 else -1.0
+        if distances(physics, self)[aim] > NEAR * self.reach:
+          step = bond(physics, aim) + OFF * up - p.tip
           most = 0.02 * p.style.speed * self.control_timestep
           p.tip = p.tip + step * min(1.0, most / max(float(np.linalg.norm(step)), 1e-9))
         yield p.step()

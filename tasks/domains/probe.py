@@ -276,6 +276,9 @@ class Press(Task):
       point, normal = self.points[k], self.normals[k]
       if not (self.pressing and distance(p.physics, self) <= self.tolerance):
         yield from p.above(point, 0.008, normal)
+      aside = p.tip - point - (p.tip - point) @ normal * normal
+      if np.linalg.norm(aside) > 1e-6:  # somebody else has begun, beside the site
+        yield from p.line(p.tip - aside, 0.01)
       middle = sum(self.band) / 2
 
       def until(done: int = done) -> bool:

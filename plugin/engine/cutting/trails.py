@@ -37,9 +37,11 @@ _MORE = 0.5  # edges after which what could not come apart is tried again
 _AGAIN, _BEHIND = 1.0, 0.5
 _SHUT = 1e-3  # angle of scissors under which they have no way to close [rad]
 _FLAT = 0.3  # cosine of a blade to the normal under which the cut goes along that
-# How far a current leaps from the wire to tissue [m]. Cutting takes up to 2.5 kV at the peak
-# (Eggleston and von Maltzahn 2000, Electrosurgical Devices, table 81.1), 1.9 kV break through so
-# much air (Paschen's law: Raizer 1991, Gas Discharge Physics, 7.2).
+# How far a current leaps from the wire to tissue [m]. Sparks cut from 200 V on (Koninckx et al.
+# 2024, 10.52054/FVVO.16.3.026); a generator's cut reaches 2.5 kV at the peak (Eggleston and von
+# Maltzahn 2000, Biomedical Engineering Handbook, chapter 81). Through so much air 1.9 kV break:
+# Paschen's law with A = 15 and B = 365 V for each cm Torr (Raizer 1991, Gas Discharge Physics),
+# 760 Torr and 0.01 electrons an ion.
 SPARK = 0.0003
 
 

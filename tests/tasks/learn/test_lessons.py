@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from palpate import tasks
 from palpate.tasks.core import performer
+from palpate.tasks.domains import probe
 from palpate.tasks.learn import lessons, policy
 
 
@@ -36,6 +37,18 @@ def test_an_expert_goes_on_with_what_has_begun(domain, begun, lost):
       break
     assert not lost(env.task)
   assert env.task.progress >= before
+
+
+def test_an_expert_presses_on_the_site_where_another_came_down_beside_it():
+  env = tasks.load("probe", "depth", task_kwargs={"random": 3, "surroundings": "none"})
+  timestep = played(env, performer.Performer(env), lambda task: task.pressing)
+  while probe.distance(env.physics, env.task) < 0.001:
+    timestep = env.step(np.array([0.3, 0.0, 0.0, 0.0]))
+  other = performer.Performer(env)
+  while not env.task.done:
+    timestep = env.step(other(timestep))
+    if env.task.held > 0.5:
+      assert probe.distance(env.physics, env.task) < 0.00025  # a limit of proficiency
 
 
 def test_a_lesson_is_what_the_expert_meant_from_its_turn_on():

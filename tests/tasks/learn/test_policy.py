@@ -222,8 +222,6 @@ def test_a_policy_of_pictures_is_refused_where_they_are_otherwise(tmp_path):
 
 SHIPPED = sorted(policy.FOLDER.glob(f"*{policy.SUFFIX}"))
 PLAYED = ("grasp_easy", "touch_easy")  # always: others take minutes
-# Those of bimanual seldom succeed, see docs/training.md: three seeds say nothing.
-SOLVING = [path for path in SHIPPED if not path.stem.startswith("bimanual")]
 
 
 def test_policies_that_come_along_are_small_and_of_their_exercise():
@@ -244,7 +242,7 @@ def test_policies_that_come_along_are_small_and_of_their_exercise():
   "path",
   [
     pytest.param(path, id=path.stem, marks=() if path.stem in PLAYED else pytest.mark.slow)
-    for path in SOLVING
+    for path in SHIPPED
   ],
 )
 def test_policies_that_come_along_solve_their_exercise(path):
