@@ -72,7 +72,7 @@ struct MujocoRod {
     const double* R = f.frame.data;
     const bool falls = !(mj.disableflags.data[0] & DISABLE_GRAVITY);
     const D3 zero = {0.0, 0.0, 0.0}, gravity = falls ? add_turned(zero, R, load(mj.gravity.data)) : zero;
-    for (int i = 0; i < rod.nnode; ++i) {
+    each_lane(0, rod.nnode, [&](int i) {
       const int adr = f.dofadr.data[i], q = f.qposadr.data[i], body = f.bodyid.data[i];
       rod.turn.data[i] = 0.0;
       D3 x = load(f.rest.data + 3 * i), v = zero, force = zero, last = zero;
@@ -91,7 +91,7 @@ struct MujocoRod {
       store(rod.vel.data + 3 * i, v);
       store(rod.last.data + 3 * i, last);
       store(rod.external.data + 3 * i, force);
-    }
+    });
   }
 };
 

@@ -160,25 +160,28 @@ PALPATE void begin(const Host& host, double h) {
   const auto& rod = host.rod;
   const int n = 4 * rod.nnode;
   host.gather(h);
-  rod.count.data[0] = 0;
-  host.note_rows();
-  rod.status.data[0] = step_rod(rod, h);
-  const bool ok = rod.status.data[0] >= 0, touched = ok && rod.count.data[0] > 0;
+  one_lane([&] {
+    rod.count.data[0] = 0;
+    host.note_rows();
+  });
+  const int status = step_rod(rod, h);
+  const bool ok = status >= 0, touched = ok && rod.count.data[0] > 0;
+  one_lane([&] { rod.status.data[0] = status; });
   if (!ok)  // holds still for this step instead of spreading the damage
-    for (int a = 0; a < 3 * rod.nnode; ++a) rod.place.data[a] = rod.start.data[a];
+    each_lane(0, 3 * rod.nnode, [&](int a) { rod.place.data[a] = rod.start.data[a]; });
   if (touched) {
     const RodMatrix H = matrix_of(rod);
-    lay_out(rod, rod.place.data);
-    for (int a = 0; a < n; ++a) rod.force.data[a] = 0.0;
+    one_lane([&] { lay_out(rod, rod.place.data); });
+    each_lane(0, n, [&](int a) { rod.force.data[a] = 0.0; });
     rows_cost(rod, rod.place.data, h, rod.force.data, &H);
     // What is not positive is left out: a thread about to buckle gives way at once, and tools would meet nothing.
     assemble(rod, rod.place.data, rod.turn.data, h, rod.gradient.data, false);
     hold(rod, rod.gradient.data, H);
     factorize_nodes(rod);
-    invert_there(H, inverse_of(rod), rod.below.data, rod.ranked.data);
+    one_lane([&] { invert_there(H, inverse_of(rod), rod.below.data, rod.ranked.data); });
   }
-  for (int i = 0; i < rod.nnode; ++i) {
-    if (!host.moves(i)) continue;
+  each_lane(0, rod.nnode, [&](int i) {
+    if (!host.moves(i)) return;
     D3 Mhat = host.inertia(i);
     if (touched) {
       const double inertia = alone(rod, i, h);
@@ -188,7 +191,7 @@ PALPATE void begin(const Host& host, double h) {
     const D3 rate = (1.0 / h) * D3{Mhat.x * dv.x, Mhat.y * dv.y, Mhat.z * dv.z};
     const D3 lagged = load(rod.external.data + 3 * i) - (touched ? load(rod.force.data + 4 * i) : D3{0.0, 0.0, 0.0});
     host.push(i, passive(rate, lagged));
-  }
+  });
 }
 
 // Ends the step: by the rod's own response to what MuJoCo found otherwise.
@@ -196,25 +199,26 @@ template <class Host>
 PALPATE void end(const Host& host, double h) {
   const auto& rod = host.rod;
   if (rod.count.data[0] > 0 && rod.status.data[0] >= 0) {
-    for (int i = 0; i < rod.nnode; ++i) {
+    each_lane(0, rod.nnode, [&](int i) {
       const D3 found = host.moves(i) ? host.found(i) : D3{0.0, 0.0, 0.0};
       store(rod.move.data + 4 * i, host.moves(i) ? found + load(rod.force.data + 4 * i) : found);
       rod.move.data[4 * i + 3] = 0.0;
-    }
+    });
     solve_nodes(rod, rod.move.data);
     const double part = safe_part(rod, rod.place.data, rod.move.data, 4);
-    for (int i = 0; i < rod.nnode; ++i) {
+    each_lane(0, rod.nnode, [&](int i) {
       store(rod.place.data + 3 * i, load(rod.place.data + 3 * i) + part * load(rod.move.data + 4 * i));
       rod.turn.data[i] += part * rod.move.data[4 * i + 3];
-    }
+    });
   }
-  for (int i = 1; i + 1 < rod.nnode && rod.twists; ++i) rod.trial.data[i] = twist_at(rod, rod.place.data, rod.turn.data, i);
-  for (int i = 1; i + 1 < rod.nnode && rod.twists; ++i) rod.own.twist.data[i] = rod.trial.data[i];
-  for (int i = 0; i < rod.nnode; ++i) {
-    if (!host.moves(i)) continue;
+  const int inner = rod.twists ? rod.nnode - 1 : 0;
+  each_lane(1, inner, [&](int i) { rod.trial.data[i] = twist_at(rod, rod.place.data, rod.turn.data, i); });
+  each_lane(1, inner, [&](int i) { rod.own.twist.data[i] = rod.trial.data[i]; });
+  each_lane(0, rod.nnode, [&](int i) {
+    if (!host.moves(i)) return;
     store(rod.own.force.data + 3 * i, host.found(i));
     host.move(i, load(rod.place.data + 3 * i) - load(rod.start.data + 3 * i), h);
-  }
+  });
 }
 
 }  // namespace palpate

@@ -101,7 +101,7 @@ struct WorldRod {
   PALPATE void gather(double h) const {
     const double* R = f.frame.data;
     const D3 none = {0.0, 0.0, 0.0}, gravity = f.falls ? add_turned(none, R, load((const float*)f.gravity.data)) : none;
-    for (int i = 0; i < rod.nnode; ++i) {
+    each_lane(0, rod.nnode, [&](int i) {
       const int adr = f.dofadr.data[i];
       rod.turn.data[i] = 0.0;
       D3 x = load(f.rest.data + 3 * i), v = none, force = none, last = none, aim = x;
@@ -119,7 +119,7 @@ struct WorldRod {
       store(rod.last.data + 3 * i, last);
       store(rod.external.data + 3 * i, force);
       store(rod.aim.data + 3 * i, aim);
-    }
+    });
   }
 };
 
@@ -133,14 +133,12 @@ PALPATE Fields of_world(Fields f, int world) {
 
 template <class Fields>
 PALPATE void begin_rods(const Fields& f, Thread t, int) {
-  if (t.tid > 0) return;
   const Fields here = of_world(f, t.world);
   begin(WorldRod<Fields>{here, t.world, f.rods.data[t.world]}, f.timestep);
 }
 
 template <class Fields>
 PALPATE void end_rods(const Fields& f, Thread t, int) {
-  if (t.tid > 0) return;
   const Fields here = of_world(f, t.world);
   end(WorldRod<Fields>{here, t.world, f.rods.data[t.world]}, f.timestep);
   if (f.rods.data[t.world].status.data[0] < 0) f.bad.data[t.world] = 1;

@@ -101,52 +101,54 @@ PALPATE double cone(const Fields& f, int r, int dim, const double* x, double h, 
   return cost;
 }
 
-// The cost of all rows; adds its gradient and second derivative where there are a gradient and a matrix.
+// The cost of this lane's rows; adds gradient and second derivative of all where there are a gradient and a matrix.
 template <class Fields>
 PALPATE double rows_cost(const Fields& f, const double* x, double h, double* g, const RodMatrix* H) {
   double cost = 0.0;
   const int n = f.count.data[0];
-  for (int r = 0; r < n;) {
+  const auto add = [&](int r) {
     const RodRow<Fields> row{f, r};
+    if (row.kind() == FRICTION) return;  // of the cone before
     if (row.kind() == CONE) {
       int dim = 1;
       while (r + dim < n && f.row_kind.data[r + dim] == FRICTION) ++dim;
       cost += cone(f, r, dim, x, h, g, H);
-      r += dim;
-      continue;
+      return;
     }
     const double residual = row.residual(x, h);
-    ++r;
-    if (row.kind() == ONE && residual >= 0.0) continue;
+    if (row.kind() == ONE && residual >= 0.0) return;
     cost += 0.5 * row.D() * residual * residual;
     if (g) add_row(f, row.node(), row.J(), row.D() * residual, row.D() / (h * h), g, H);
-  }
+  };
+  if (!g) each_lane(0, n, add);
+  if (g) one_lane([&] { for (int r = 0; r < n; ++r) add(r); });
   return cost;
 }
 
 template <class Fields>
 PALPATE double step_cost(const Fields& f, const double* x, const double* turn, double h) {
   double sum = 0.0;
-  for (int i = 0; i < f.nnode; ++i) {
+  each_lane(0, f.nnode, [&](int i) {
     const D3 off = load(x + 3 * i) - load(f.aim.data + 3 * i);
     sum += 0.5 * f.mass.data[i] / (h * h) * dot(off, off) + 0.5 * f.spin.data[i] / (h * h) * turn[i] * turn[i];
-  }
-  return sum + rod_energy(f, x, turn) + contacts_energy(f, x, h, nullptr, nullptr, false) +
-         h * h * rows_cost(f, x, h, nullptr, nullptr);
+  });
+  const double own = sum + rod_energy(f, x, turn) + contacts_energy(f, x, h, nullptr, nullptr, false) +
+                     h * h * rows_cost(f, x, h, nullptr, nullptr);
+  return sum_together(own);
 }
 
 // The gradient at a trial state, and the matrix, see `add_rod`; both without what other bodies do.
 template <class Fields>
 PALPATE void assemble(const Fields& f, const double* x, const double* turn, double h, double* g, bool exact) {
-  lay_out(f, x);
+  one_lane([&] { lay_out(f, x); });
   const RodMatrix H = matrix_of(f);
-  for (int a = 0; a < f.count.data[2]; ++a) H.value[a] = 0.0;
-  for (int i = 0; i < f.nnode; ++i) {
+  each_lane(0, f.count.data[2], [&](int a) { H.value[a] = 0.0; });
+  each_lane(0, f.nnode, [&](int i) {
     const double m = f.mass.data[i] / (h * h), spin = f.spin.data[i] / (h * h);
     store(g + 4 * i, m * (load(x + 3 * i) - load(f.aim.data + 3 * i)));
     g[4 * i + 3] = spin * turn[i];
     for (int c = 0; c < H.per; ++c) H.at(H.of(i, c), H.of(i, c)) = c < 3 ? m : spin;
-  }
+  });
   add_rod(f, x, turn, g, H, exact);
   contacts_energy(f, x, h, g, &H, exact);
 }
@@ -160,22 +162,27 @@ PALPATE void hold(const Fields& f, double* g, const RodMatrix& H) {
     for (int c = 0; c < 4; ++c) {
       if (!f.held.data[4 * i + c]) continue;
       g[4 * i + c] = 0.0;
-      if (c < H.per) held[count++] = H.of(i, c);
+      if (c < H.per) held[count++] = H.of(i, c);  // by all lanes alike
     }
   }
-  for (int a = 0; a < H.n && count; ++a)
+  meet_lanes();
+  if (!count) return;
+  each_lane(0, H.n, [&](int a) {
     for (int k = 0; k < count; ++k)
       if (held[k] <= a && held[k] >= H.first[a]) H.row(a)[held[k]] = 0.0;
-  for (int k = 0; k < count; ++k) {
+  });
+  each_lane(0, count, [&](int k) {
     for (int b = H.first[held[k]]; b < held[k]; ++b) H.row(held[k])[b] = 0.0;
     H.at(held[k], held[k]) = 1.0;
-  }
+  });
 }
 
 template <class Fields>
 PALPATE bool factorize_nodes(const Fields& f) {
   const RodMatrix H = matrix_of(f);
-  return f.twists ? factorize<4>(H, f.ranked.data) : factorize<3>(H, f.ranked.data);
+  double found = 0.0;
+  one_lane([&] { found = f.twists ? factorize<4>(H, f.ranked.data) : factorize<3>(H, f.ranked.data); });
+  return sum_together(found) > 0.0;
 }
 
 // A^-1 b in place of b, four numbers a node, from the factors.
@@ -183,21 +190,23 @@ template <class Fields>
 PALPATE void solve_nodes(const Fields& f, double* b) {
   const RodMatrix H = matrix_of(f);
   double* y = f.ranked.data;
-  for (int i = 0; i < f.nnode; ++i)
+  each_lane(0, f.nnode, [&](int i) {
     for (int c = 0; c < H.per; ++c) y[H.of(i, c)] = b[4 * i + c];
-  solve_factorized(H, y);
-  for (int i = 0; i < f.nnode; ++i)
+  });
+  one_lane([&] { solve_factorized(H, y); });
+  each_lane(0, f.nnode, [&](int i) {
     for (int c = 0; c < 4; ++c) b[4 * i + c] = c < H.per ? y[H.of(i, c)] : 0.0;
+  });
 }
 
 // Starts from where the nodes go with their last acceleration, as far as they do not meet.
 template <class Fields>
 PALPATE void predict(const Fields& f, double h) {
-  for (int i = 0; i < f.nnode; ++i) {
+  each_lane(0, f.nnode, [&](int i) {
     store(f.trial.data + 3 * i, h * load(f.vel.data + 3 * i) + h * h * load(f.last.data + 3 * i));
-  }
+  });
   const double part = safe_part(f, f.start.data, f.trial.data, 3);
-  for (int a = 0; a < 3 * f.nnode; ++a) f.place.data[a] = f.start.data[a] + part * f.trial.data[a];
+  each_lane(0, 3 * f.nnode, [&](int a) { f.place.data[a] = f.start.data[a] + part * f.trial.data[a]; });
 }
 
 // Takes the step from f.start and f.vel: f.place and f.turn are where it ends, f.predicted the force of
@@ -210,16 +219,21 @@ PALPATE int step_rod(const Fields& f, double h) {
   double* g = f.gradient.data;
   double* trial = f.trial.data;
   double* trial_turn = f.trial.data + 3 * f.nnode;
-  f.reach.data[0] = reach_of(f, h);
-  list_pairs(f, f.start.data);
-  note_pressure(f);
+  const double reach = reach_of(f, h);
+  one_lane([&] {
+    f.reach.data[0] = reach;
+    list_pairs(f, f.start.data);
+    note_pressure(f);
+  });
   predict(f, h);
   double cost = step_cost(f, x, turn, h);
   int iteration = 0;
   for (; iteration < f.newton; ++iteration) {
     if (is_stale(f, x)) {
-      list_pairs(f, x);
-      note_pressure(f);
+      one_lane([&] {
+        list_pairs(f, x);
+        note_pressure(f);
+      });
       cost = step_cost(f, x, turn, h);
     }
     const RodMatrix H = matrix_of(f);
@@ -228,33 +242,34 @@ PALPATE int step_rod(const Fields& f, double h) {
       assemble(f, x, turn, h, g, exact);
       rows_cost(f, x, h, g, &H);
       hold(f, g, H);
-      for (int a = 0; a < n; ++a) f.move.data[a] = -g[a];
+      each_lane(0, n, [&](int a) { f.move.data[a] = -g[a]; });
       if (factorize_nodes(f)) break;
       if (!exact) return -1;
     }
     solve_nodes(f, f.move.data);
     double falls = 0.0, most = 0.0;
-    for (int a = 0; a < n; ++a) falls += g[a] * f.move.data[a];
-    for (int i = 0; i < f.nnode; ++i) {
+    each_lane(0, n, [&](int a) { falls += g[a] * f.move.data[a]; });
+    each_lane(0, f.nnode, [&](int i) {
       const double far = norm(load(f.move.data + 4 * i));
       most = far > most ? far : most;
-    }
+    });
+    falls = sum_together(falls), most = most_together(most);
     if (!(falls == falls) || !(most < 1e6)) return -1;
     const double whole = safe_part(f, x, f.move.data, 4);
     double part = whole;
     for (int k = 0; k < HALVINGS; ++k, part *= 0.5) {
-      for (int i = 0; i < f.nnode; ++i) {
+      each_lane(0, f.nnode, [&](int i) {
         store(trial + 3 * i, load(x + 3 * i) + part * load(f.move.data + 4 * i));
         trial_turn[i] = turn[i] + part * f.move.data[4 * i + 3];
-      }
+      });
       const double next = step_cost(f, trial, trial_turn, h);
       if (next <= cost + SLOPE * part * falls || -part * falls < 1e-13 * cost) {
         cost = next;
         break;
       }
     }
-    for (int a = 0; a < 3 * f.nnode; ++a) x[a] = trial[a];
-    for (int i = 0; i < f.nnode; ++i) turn[i] = trial_turn[i];
+    each_lane(0, 3 * f.nnode, [&](int a) { x[a] = trial[a]; });
+    each_lane(0, f.nnode, [&](int i) { turn[i] = trial_turn[i]; });
     // A move that was cut short by contacts is not the last one.
     if (part * most < CLOSE * f.radius && whole == 1.0) return iteration + 1;
   }

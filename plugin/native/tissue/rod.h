@@ -6,6 +6,7 @@
 // to step; it changes by the edges' turns, and by how the frames that the rod carries along turn with its
 // tangents.
 #pragma once
+#include "core/lanes.h"
 #include "core/triangle.h"
 #include "solver/envelope.h"
 
@@ -60,21 +61,21 @@ PALPATE double twist_at(const Fields& f, const double* x, const double* turn, in
          turned_against(tangent(x0, i - 1), tangent(x0, i), tangent(x, i - 1), tangent(x, i));
 }
 
-// The elastic energy [J].
+// The elastic energy of this lane's nodes [J].
 template <class Fields>
 PALPATE double rod_energy(const Fields& f, const double* x, const double* turn) {
   double sum = 0.0;
-  for (int i = 0; i + 1 < f.nnode; ++i) {
+  each_lane(0, f.nnode - 1, [&](int i) {
     const double longer = norm(load(x + 3 * i + 3) - load(x + 3 * i)) - f.length.data[i];
     sum += 0.5 * f.stretch.data[i] * longer * longer;
-    if (!i) continue;
+    if (!i) return;
     const D3 k = bent(x, i).curvature;
     sum += 0.5 * f.bend.data[i] * dot(k, k);
     if (f.twists) {
       const double m = twist_at(f, x, turn, i);
       sum += 0.5 * f.torsion.data[i] * m * m;
     }
-  }
+  });
   return sum;
 }
 
@@ -147,7 +148,7 @@ PALPATE void add_twist(const Fields& f, const Bent& b, int i, double twist, doub
 // that is positive: without the thrust of edges, and without what a moment does as edges turn.
 template <class Fields>
 PALPATE void add_rod(const Fields& f, const double* x, const double* turn, double* g, const RodMatrix& H, bool exact) {
-  for (int i = 0; i + 1 < f.nnode; ++i) {
+  each_apart<2>(0, f.nnode - 1, [&](int i) {
     const D3 e = load(x + 3 * i + 3) - load(x + 3 * i);
     const double l = norm(e) + 1e-300, k = f.stretch.data[i], tension = k * (l - f.length.data[i]);
     const double w[2] = {-1.0, 1.0}, across = exact || tension > 0.0 ? tension / l : 0.0;
@@ -156,8 +157,8 @@ PALPATE void add_rod(const Fields& f, const double* x, const double* turn, doubl
     terms.add_each(w, across);
     const int node[2] = {i, i + 1};
     terms.scatter(node, g, H);
-  }
-  for (int i = 1; i + 1 < f.nnode; ++i) {
+  });
+  each_apart<3>(1, f.nnode - 1, [&](int i) {
     // The energy is 2 B t^2, t the tangent of half the angle between the edges: in their plane a function
     // of that angle, across it of how they turn against each other and with each other.
     const Bent b = bent(x, i);
@@ -188,7 +189,7 @@ PALPATE void add_rod(const Fields& f, const double* x, const double* turn, doubl
     const int node[3] = {i - 1, i, i + 1};
     terms.scatter(node, g, H);
     if (f.twists) add_twist(f, b, i, twist_at(f, x, turn, i), g, H);
-  }
+  });
 }
 
 }  // namespace palpate

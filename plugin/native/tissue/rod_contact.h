@@ -62,11 +62,11 @@ PALPATE Barrier barrier(const Fields& f, double distance) {
 template <class Fields>
 PALPATE double reach_of(const Fields& f, double h) {
   double fastest = 0.0;
-  for (int i = 0; i < f.nnode; ++i) {
+  each_lane(0, f.nnode, [&](int i) {
     const double v = norm(load(f.vel.data + 3 * i));
     fastest = v > fastest ? v : fastest;
-  }
-  return LISTED * f.radius + AHEAD * h * fastest;
+  });
+  return LISTED * f.radius + AHEAD * h * most_together(fastest);
 }
 
 // Lists the pairs of edges that are near each other at x; returns whether there is room for all.
@@ -266,29 +266,40 @@ PALPATE D3 slid(const Fields& f, int p, const double* x) {
   return u - dot(u, normal) * normal;
 }
 
-// The energy of contacts at x; adds its gradient and second derivative where there are a gradient and a matrix,
-// see `add_rod`.
+// What a pair adds.
+struct PairTerms {
+  int node[4];
+  union { Terms<4> terms; };  // there where it is asked for
+
+  PALPATE PairTerms() {}
+  PALPATE Terms<4>& begin(int i, int j) {
+    node[0] = i, node[1] = i + 1, node[2] = j, node[3] = j + 1;
+    return terms = Terms<4>();
+  }
+};
+
+// The energy of this lane's contacts at x; adds the gradient and second derivative of all where there are a gradient
+// and a matrix, see `add_rod`.
 template <class Fields>
 PALPATE double contacts_energy(const Fields& f, const double* x, double h, double* g, const RodMatrix* H, bool exact) {
   const double slow = h * f.smooth.data[0];
   double sum = 0.0;
-  for (int p = 0; p < f.count.data[1]; ++p) {
+  const auto add_pair = [&](int p, PairTerms& own) {
     const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
-    const int node[4] = {i, i + 1, j, j + 1};
     const double limit = f.friction * f.pressure.data[p];
-    if (!(limit > 0.0) && (limit < 0.0 || !may_be_near(f, x, i, j, 2.0 * f.radius))) continue;
+    if (!(limit > 0.0) && (limit < 0.0 || !may_be_near(f, x, i, j, 2.0 * f.radius))) return false;
     const Nearest at = nearest_edges(x, i, j);
     const double distance = norm(at.off);
     const Barrier b = barrier(f, distance);
     const bool touches = b.energy > 0.0;
-    if (!touches && !(limit > 0.0)) continue;
-    Terms<4> terms;
+    if (!touches && !(limit > 0.0)) return false;
+    Terms<4>& terms = own.begin(i, j);
     if (touches) {
       sum += b.energy;
       if (g) {
         const double w[4] = {1.0 - at.s, at.s, at.t - 1.0, -at.t}, per = exact ? b.slope / distance : 0.0;
         terms.add(w, (1.0 / distance) * at.off, b.slope, b.bend - per);
-        if (exact) add_turning(terms, x, node, at, w, per);
+        if (exact) add_turning(terms, x, own.node, at, w, per);
       }
     }
     if (limit > 0.0) {
@@ -305,8 +316,9 @@ PALPATE double contacts_energy(const Fields& f, const double* x, double h, doubl
         terms.add(w, across, 0.0, limit * s.per);
       }
     }
-    if (g) terms.scatter(node, g, *H);
-  }
+    return g != nullptr;
+  };
+  each_in_turn<PairTerms>(f.count.data[1], add_pair, [&](const PairTerms& own) { own.terms.scatter(own.node, g, *H); });
   return sum;
 }
 
@@ -333,11 +345,11 @@ PALPATE void note_pressure(const Fields& f) {
 template <class Fields>
 PALPATE double moved_since(const Fields& f, const double* x) {
   double most = 0.0;
-  for (int i = 0; i < f.nnode; ++i) {
+  each_lane(0, f.nnode, [&](int i) {
     const double far = norm(load(x + 3 * i) - load(f.listed.data + 3 * i));
     most = far > most ? far : most;
-  }
-  return most;
+  });
+  return most_together(most);
 }
 
 // Whether pairs have to be listed again: half of what they may move has gone.
@@ -385,19 +397,21 @@ PALPATE double safe_for(const Fields& f, const double* x, const double* move, in
 template <class Fields>
 PALPATE double safe_part(const Fields& f, const double* x, const double* move, int stride) {
   double part = 1.0, most = 0.0;
-  for (int i = 0; i < f.nnode; ++i) {
+  each_lane(0, f.nnode, [&](int i) {
     const double far = norm(load(move + stride * i));
     most = far > most ? far : most;
-  }
+  });
+  most = most_together(most);
   if (!f.collides) return part;
   const double room = 0.5 * f.reach.data[0] - moved_since(f, x);  // for what is not listed
   if (part * most > room) part = room / most;
-  for (int p = 0; p < f.count.data[1]; ++p) {
+  each_lane(0, f.count.data[1], [&](int p) {
     const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
-    if (f.pressure.data[p] < 0.0) continue;
+    if (f.pressure.data[p] < 0.0) return;
     const double meets = 2.0 * CORE * f.radius + 2.0 / (1.0 - LEFT) * part * most;
     if (may_be_near(f, x, i, j, meets)) part = safe_for(f, x, move, stride, i, j, part);
-  }
+  });
+  part = least_together(part);
   return part > 0.0 ? part : 0.0;
 }
 
