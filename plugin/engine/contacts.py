@@ -101,6 +101,7 @@ class Weights:
   geom_type: ints("ngeom")
   geom_size: doubles("ngeom", 3)
   flex_radius: doubles("nflex")
+  flex_margin: doubles("nflex")
   flex_dim: ints("nflex")
   flex_vertadr: ints("nflex")
   flex_vertbodyid: ints("nflexvert")

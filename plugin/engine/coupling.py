@@ -258,7 +258,8 @@ def sizes(organ: "Declaration") -> dict[str, int]:
     return out | nodal_sizes(organ.nfree, 3 * (organ.mesh.nvert - organ.mesh.nskin) * solid)
   win = organ.windows
   out["nrest"] = outer(organ) if organ.config.support else 0
-  return out | {"nvert": organ.mesh.nvert, "nslot": win.nslot, "ngeom": win.geom.size}
+  followed = win.geom.size + win.line.size
+  return out | {"nvert": organ.mesh.nvert, "nslot": win.nslot, "ngeom": followed}
 
 
 def nodal_sizes(nfree: int, ninner: int) -> dict[str, int]:

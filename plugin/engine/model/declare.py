@@ -136,6 +136,7 @@ class Windows:
     elem_adr: where its triangles start in flex_elem
     elem_num: how many it can hold
     geom: geoms that it follows                               (ngeom,)
+    line: first vertices of edges of threads that it follows  (nline,)
     mass: mass of each node [kg]                              (nvert,)
   """
 
@@ -149,6 +150,7 @@ class Windows:
   elem_adr: int
   elem_num: int
   geom: np.ndarray
+  line: np.ndarray
   mass: np.ndarray
 
   @property

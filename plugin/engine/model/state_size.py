@@ -29,8 +29,11 @@ def state_size(model: int, instance: int) -> int:
     rows = mjstruct.config(model, instance, key).strip()
     sizes[name] = rows.count(",") + 1 if rows else 0
   if mjstruct.config(model, instance, "window").strip():
-    # A window's vertices count as the organ's, which have more numbers than a slot.
-    sizes |= {"nvert": most, "nslot": 0, "ngeom": m.ngeom, "nrelax": relaxes * most}
+    # A window's vertices count as the organ's, which have more numbers than a slot. Edges of
+    # threads that it follows have a vertex that moves, which has two of them at most.
+    threads = [k for k in range(m.nplugin) if declare.is_rod(model, k)]
+    lines = sum(2 * len(declare.moving_bodies(m, k)) for k in threads)
+    sizes |= {"nvert": most, "nslot": 0, "ngeom": m.ngeom + lines, "nrelax": relaxes * most}
     sizes |= {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
     return layout.size(WindowState, sizes)
   moving = len(declare.moving_bodies(m, instance))

@@ -125,6 +125,7 @@ def _windows(
     elem_adr=int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[flex]),
     elem_num=elem_num,
     geom=_followed(m, name, config, flex),
+    line=_lines(model, m, instance, config, flex),
     mass=mass,
   )
 
@@ -196,6 +197,31 @@ def _followed(m: mjstruct.Struct, name: str, config: Config, flex: int) -> np.nd
   return np.array([g for g in meets if bodyid[g] in wanted], np.int64)
 
 
+def _lines(model: int, m: mjstruct.Struct, instance: int, config: Config, flex: int) -> np.ndarray:
+  """Returns the first vertex of each edge that a window follows, of threads that it may touch."""
+  kind, meets, start, body = (
+    mjstruct.view(getattr(m, f"flex_{key}"), size, np.int32)
+    for key, size in (
+      ("contype", m.nflex), ("conaffinity", m.nflex), ("vertadr", m.nflex),
+      ("vertbodyid", m.nflexvert),
+    )
+  )  # fmt: skip
+  moves = mjstruct.view(m.body_dofnum, m.nbody, np.int32)[body] > 0
+  found = []
+  for thread in _threads(model, m, instance):
+    if not config.follow and (kind[thread] & meets[flex] or kind[flex] & meets[thread]):
+      first = start[thread] + np.arange(flexes.vertices(m, thread) - 1)
+      found.append(first[moves[first] | moves[first + 1]])
+  return np.concatenate([np.zeros(0, np.int64), *found])
+
+
+def _threads(model: int, m: mjstruct.Struct, instance: int) -> list[int]:
+  """Returns the flexes that are threads of the plugin that has an instance."""
+  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
+  mine = [k for k in range(m.nplugin) if plugin[k] == plugin[instance]]
+  return [declare.flex_of(m, k) for k in mine if declare.is_rod(model, k)]
+
+
 def _check_neighbours(
   m: mjstruct.Struct,
   model: int,
@@ -208,7 +234,7 @@ def _check_neighbours(
 ):
   """Raises ValueError where a flex is beside the organ and collides with its windows.
 
-  Windows follow geoms: they would not be there.
+  Windows follow geoms and edges of threads: they would not be there.
   """
   own = np.arange(m.nflex) == windows.flex
   contype = mjstruct.view(m.flex_contype, m.nflex, np.int32)
@@ -218,7 +244,10 @@ def _check_neighbours(
   points = origin + rest @ frame.T
   room = _NEAR * float(np.linalg.norm(np.ptp(points, axis=0)))
   low, high = points.min(axis=0) - room, points.max(axis=0) + room
+  first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
   for f in np.flatnonzero(~own):
+    if np.isin(first[f] + np.arange(flexes.vertices(m, int(f))), windows.line).any():
+      continue
     if flexes.name(m, surface.get(int(f), int(f))) in bearing:
       continue
     meets = (contype[f] & conaffinity[own]) | (conaffinity[f] & contype[own])

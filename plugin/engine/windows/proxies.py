@@ -36,7 +36,7 @@ class Slots:
 
   nvert: int  # vertices
   nslot: int  # slots
-  ngeom: int  # geoms that the window follows
+  ngeom: int  # geoms that the window follows, and edges of threads
   nroom: int  # triangles, and walls that cuts may open
   most: int  # candidates that the outbox has room for
   resident: int  # 1 if the motion stays on a device and the plugin state may be old
@@ -70,7 +70,9 @@ class Slots:
   bodyid: ints("nslot")  # its body
   elem_adr: int  # where its triangles start in flex_elem
   elem_num: int  # how many it can hold
-  geom: ints("ngeom")  # geoms that it follows
+  geom: ints("ngeom")  # geoms that it follows; of edges -1 less the first vertex
+  flexvert_xpos: doubles("nflexvert", 3)
+  line_radius: doubles("ngeom")  # of edges [m]
   # What changes:
   placed: ints("nslot")  # node of a slot in the model, -1 for none
   taken: ints("nvert")  # slot of a node, -1 for none
@@ -148,7 +150,14 @@ def make(
   lengths, longest = _edges(mesh)
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex])
   margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex])
-  margin += float(mjstruct.view(m.geom_margin, m.ngeom)[win.geom].max(initial=0.0))
+  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  thread = np.searchsorted(start, win.line, side="right") - 1  # the flex of each edge
+  margins = (
+    *mjstruct.view(m.geom_margin, m.ngeom)[win.geom],
+    *mjstruct.view(m.flex_margin, m.nflex)[thread],
+  )
+  margin += float(max(margins, default=0.0))
+  thick = mjstruct.view(m.flex_radius, m.nflex)[thread]
   room = max(mesh.whole.nelem, sizes["ncorner"])
   values = {**boxes} | {name: kept[name] for name in scratch(0, 0)} | dict(
     nvert=sizes["nvert"],
@@ -184,7 +193,9 @@ def make(
     bodyid=win.body,
     elem_adr=win.elem_adr,
     elem_num=win.elem_num,
-    geom=win.geom,
+    geom=np.append(win.geom, -1 - win.line),
+    line_radius=np.append(np.zeros(win.geom.size), thick),
+    flexvert_xpos=coupling.mujoco_arrays(host.model, host.data, Slots).flexvert_xpos,
     lagged=host.arrays["lagged"],
     status=host.arrays["status"],
     mj=coupling.mujoco_arrays(host.model, host.data),

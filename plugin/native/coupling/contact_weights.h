@@ -173,6 +173,16 @@ PALPATE void lift(const Fields& f, Thread, int) {
   }
 }
 
+// By how much a thread's contacts are there before they touch, see `mujoco_rod.h`; 0 of others.
+template <class Fields>
+PALPATE double ahead(const Fields& f, const char* contact) {
+  for (int side = 0; side < 2; ++side) {
+    const int flex = side_of(contact, CONTACT_FLEX, side);
+    if (flex >= 0 && f.mine.data[flex] && f.flex_dim.data[flex] == 1) return f.flex_margin.data[flex];
+  }
+  return 0.0;
+}
+
 // Gives contacts with an organ their rows, and flags that what MuJoCo has computed of them for its dual
 // solvers has to be computed again. Done twice it does nothing.
 template <class Fields>
@@ -194,7 +204,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
     const Rows rows = is_mine(f, contact) ? rows_of(f, contact) : Rows{0, 0, false};
     if (!rows.count) continue;
     touched = true;
-    double off = 0.0;
+    double off = ahead(f, contact);
     const Touch touch = touch_of(f, contact);
     if (touch.geom >= 0) {
       if (!(touch == last)) series = series_of(f, contacts, ncon, touch);

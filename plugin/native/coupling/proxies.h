@@ -4,6 +4,7 @@
 #include "coupling/assign_proxies.h"
 #include "coupling/window_mesh.h"
 #include "coupling/sleep.h"
+#include "core/triangle.h"
 
 namespace palpate {
 
@@ -91,6 +92,22 @@ PALPATE void tell_geom(const Fields& f, int g, double* geom) {
   geom[GEOM_BOUND2] = r > 0.0 ? (r + f.reach) * (r + f.reach) : ENDLESS;
 }
 
+// Writes the edge of a thread from vertex `v` on to the inbox, as a capsule.
+template <class Fields>
+PALPATE void tell_line(const Fields& f, int v, double radius, double* geom) {
+  const D3 a = load(f.flexvert_xpos.data + 3 * v), b = load(f.flexvert_xpos.data + 3 * v + 3), none = {0.0, 0.0, 0.0};
+  const D3 axis = unit(b - a), side = fabs(axis.x) < 0.6 ? D3{1.0, 0.0, 0.0} : D3{0.0, 1.0, 0.0};
+  const D3 x = unit(cross(side, axis)), axes[3] = {x, cross(axis, x), axis};
+  const double half = 0.5 * norm(b - a);
+  store(geom + GEOM_POS, add_turned(none, f.frame.data, 0.5 * (a + b) - load(f.origin.data)));
+  for (int k = 0; k < 3; ++k) store(geom + GEOM_AXIS + 3 * k, add_turned(none, f.frame.data, axes[k]));
+  geom[GEOM_TYPE] = GEOM_IS_CAPSULE;
+  store(geom + GEOM_SIZE, {radius, half, 0.0});
+  store(geom + GEOM_BOX, none);
+  store(geom + GEOM_HALF, {radius, radius, radius + half});
+  geom[GEOM_BOUND2] = (radius + half + f.reach) * (radius + half + f.reach);
+}
+
 // Whether a geom's box and the organ's bounds are apart: boxes apart along an axis of one are.
 template <class Fields>
 PALPATE bool is_apart(const Fields& f, const double* geom) {
@@ -136,7 +153,11 @@ PALPATE bool tell_geoms(const Fields& f) {
   bool near = last[TAIL_HIGH] <= last[TAIL_LOW], stirs = near;  // they are not known yet
   for (int q = 0; q < f.ngeom; ++q) {
     double* geom = geom_at(f, q);
-    tell_geom(f, f.geom.data[q], geom);
+    const int g = f.geom.data[q];
+    if (g < 0)
+      tell_line(f, -1 - g, f.line_radius.data[q], geom);
+    else
+      tell_geom(f, g, geom);
     if (is_apart(f, geom)) continue;
     near = true;
     stirs = stirs || !(gone(f, geom, q) < last[TAIL_LEEWAY]);
