@@ -166,7 +166,8 @@ def push(batch: Worlds, world: int, data: mujoco.MjData):
   _assign(d.qacc_warmstart, world, np.zeros(d.qacc_warmstart.shape[1]))
   _assign(d.mocap_quat, world, data.mocap_quat)
   _assign(d.eq_active, world, data.eq_active.astype(bool))
-  for array, values in ((d.geom_xpos, scratch.geom_xpos), (d.geom_xmat, scratch.geom_xmat)):
+  poses = (d.geom_xpos, scratch.geom_xpos), (d.geom_xmat, scratch.geom_xmat)
+  for array, values in poses if model.ngeom else ():
     row = array[world].numpy()
     row[: model.ngeom] = values.reshape(model.ngeom, *row.shape[1:])
     _assign(array, world, row)

@@ -94,6 +94,12 @@ def test_a_thread_over_an_organ_is_borne_by_it(device):
   assert np.abs(organ.xpos.numpy() - alone.xpos[: organ.nvert]).max() < 2e-5  # dented by 0.8 mm
   assert off(thread, worlds) < 5e-4  # of its ends, which swing
   assert not worlds.overflow.numpy().any()
+  there = mujoco.MjData(model)
+  worlds.get_state(0, there)
+  worlds.set_state(1, there)
+  worlds.step(2)
+  first, second = worlds.thread("t").xpos.numpy()
+  np.testing.assert_allclose(first, second, atol=1e-5)
 
 
 @SLOW

@@ -9,6 +9,10 @@ the difference of the probe's force from that of the plugin on the CPU over the 
 that is pressed deepest, as a share of the greatest. On CUDA the parts of a step are timed by
 themselves afterwards: the organ's before and after mujoco_warp's step, and that. Several devices
 share the worlds: `--device cuda:0+cuda:1`.
+
+    palpate bench batch --device cuda:0 --nodes 258 --worlds 256 --thread 57
+
+lays a silk 3-0 of so many nodes, 2.5 mm apart, over the sphere in place of the ball.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ import time
 
 import mujoco
 import numpy as np
+import palpate
 import palpate.batch
 import scenes
 import warp as wp
@@ -28,18 +33,33 @@ from benchmarks.runner import Bench, Case, Row
 from palpate.models.meshing import grid
 
 RADIUS, BALL, H, DEEP = 0.05, 0.006, 1e-3, 0.006
+EDGE = 2.5e-3  # of a thread [m]
 STEPS = 150  # of the press, and of what is timed together
 
 
-def scene(nodes: int, bend: float, condim: int, tolerance: float) -> mujoco.MjSpec:
-  """Returns an organ of about `nodes` nodes under a ball."""
+def scene(nodes: int, bend: float, condim: int, tolerance: float, thread: int = 0) -> mujoco.MjSpec:
+  """Returns an organ of about `nodes` nodes under a ball, or a thread of some nodes."""
   point, elem = grid.octasphere(max(2, round(np.sqrt((nodes - 2) / 4))))
   keys = {"young": 3e4, "poisson": 0.3, "foundation": 1e5, "bend": bend, "tolerance": tolerance}
   contact = {"condim": condim}
   organ = scenes.organ(RADIUS * np.asarray(point), elem, contact=contact, **keys)
+  if thread:
+    made = scenes.world(organ, h=H, gravity=(0, 0, -9.81), tolerance=1e-8)
+    spec = mujoco.MjSpec.from_string(made)
+    lay(spec, thread)
+    return spec
   ball = scenes.ball(RADIUS + BALL + 0.0007, BALL)
   drive = '<actuator><position joint="z" kp="500" kv="10"/></actuator>'
   return mujoco.MjSpec.from_string(scenes.world(organ, ball, h=H, tolerance=1e-8, extra=drive))
+
+
+def lay(spec: mujoco.MjSpec, count: int):
+  """Lays a thread over the sphere, its ends hanging."""
+  r = RADIUS + 0.0013
+  s = EDGE * (np.arange(count) - 0.5 * (count - 1))
+  angle = np.clip(s / r, -np.pi / 2, np.pi / 2)
+  below = np.abs(s - r * angle)
+  palpate.add_thread(spec, np.stack([r * np.sin(angle), 0 * s, r * np.cos(angle) - below], axis=1))
 
 
 def depths(nworld: int) -> np.ndarray:
@@ -51,7 +71,8 @@ def press(batch, record: bool = False) -> np.ndarray:
   """Drives the balls down; returns the force on the first world's in each step [N]."""
   forces = []
   for k in range(STEPS):
-    batch.ctrl = -(depths(batch.nworld) * min(1.0, 1.5 * k / STEPS))[:, None]
+    if batch.model.nu:
+      batch.ctrl = -(depths(batch.nworld) * min(1.0, 1.5 * k / STEPS))[:, None]
     batch.step()
     if record:
       forces.append(batch.organ("organ").contact_force.numpy()[0].sum(axis=0)[2])
@@ -72,16 +93,17 @@ def measure(
   condim: int,
   tolerance: float,
   repeat: bool,
+  thread: int = 0,
 ) -> dict:
   """Returns what steps of a batch take."""
-  spec = scene(nodes, bend, condim, tolerance)
+  spec = scene(nodes, bend, condim, tolerance, thread)
   names = device.split("+")
   start, target = time.perf_counter(), wp.get_device(names[0] if "cuda" in names[0] else "cpu")
   free = target.free_memory if target.is_cuda else 0
   where = names if len(names) > 1 else device
   batch = palpate.batch.make(spec, nworld, where, nodes=slots, deterministic=repeat)
   made, rms = time.perf_counter() - start, float("nan")
-  if nworld <= 1024 and condim == 1:
+  if nworld <= 1024 and condim == 1 and not thread:
     found, expected = press(batch, record=True), alone(scene(nodes, bend, condim, tolerance))
     rms = float(np.sqrt(np.mean((found - expected) ** 2)) / np.abs(expected).max())
   else:
@@ -91,7 +113,8 @@ def measure(
   used = (free - target.free_memory) / here if target.is_cuda else float("nan")
   before = time.perf_counter()
   for k in range(STEPS // 10):
-    batch.ctrl = -(depths(nworld) - 0.001 * (k % 2))[:, None]
+    if batch.model.nu:
+      batch.ctrl = -(depths(nworld) - 0.001 * (k % 2))[:, None]
     batch.step(10)
   wp.synchronize()
   step = (time.perf_counter() - before) / (STEPS // 10 * 10)
@@ -107,6 +130,7 @@ def measure(
     "condim": condim,
     "tolerance": tolerance,
     "repeat": repeat,
+    "thread": thread,
     "step_ms": 1e3 * step,
     "rate": nworld / step,
     "world_kB": used / 1e3,
@@ -158,16 +182,17 @@ def arguments(parser: argparse.ArgumentParser):
   add("--condim", type=int, nargs="+", default=[1])
   add("--tolerance", type=float, default=1e-3)
   add("--slots", type=int, nargs="+", help="nodes that the ball may touch, one a size or for all")
+  add("--thread", type=int, default=0, help="nodes of a thread in place of the ball")
   add("--repeat", action="store_true", help="runs that repeat to the bit whatever the GPU does")
 
 
 def stages(args: argparse.Namespace) -> list[list[Case]]:
   """Returns a case a size, number of worlds, and kind of tissue and contact."""
-  keys = {name: getattr(args, name) for name in ("device", "tolerance", "repeat")}
+  keys = {name: getattr(args, name) for name in ("device", "tolerance", "repeat", "thread")}
   slots = args.slots or [None]
   slots = dict(zip(args.nodes, slots * (len(args.nodes) // len(slots)), strict=True))
   worlds = args.worlds or ([8] if args.device == "cpu" else [1024, 4096, 16384])
-  kind = "-repeat" * args.repeat
+  kind = "-repeat" * args.repeat + f"-thread{args.thread}" * bool(args.thread)
   many = f"-x{args.device.count('+') + 1}" * ("+" in args.device)
   cases = [
     {"case": f"{n}-{w}-{bend:g}-{c}-{slots[n] or 0}{kind}{many}", "nodes": n, "nworld": w}
@@ -201,7 +226,14 @@ def table(out: pathlib.Path) -> list[str]:
       rms = row["force_rms"]
       split = [f"{row[name]:.2f}" for name in _PARTS if row[name] == row[name]]
       same = " (repeats)" if str(row["repeat"]) in ("True", "1") else ""
-      cells = [row["device"] + same, row["nodes"], row["bend"], row["condim"], row["nworld"]]
+      sewn = f", a thread of {row['thread']:g}" if row.get("thread") else ""
+      cells = [
+        row["device"] + same,
+        f"{row['nodes']}{sewn}",
+        row["bend"],
+        row["condim"],
+        row["nworld"],
+      ]
       cells += [
         f"{row['step_ms']:.3g} ms",
         f"{row['rate']:.3g}",
