@@ -52,7 +52,7 @@ def add_thread(
     pin: nodes that do not move; two next to each other hold the direction and turn of their edge
     rgba: colour
     contact: attributes of <contact> that are not as usual
-    **config: keys of a rod that are not the material's: young, poisson, bend, twist
+    **config: keys of a rod that are not the material's: young, poisson, bend, twist, strength
 
   Returns:
     The flex, for instance to give it a material.
@@ -69,7 +69,12 @@ def add_thread(
     raise ValueError(f"thread {name!r}: points is {nodes.shape}, expected (n, 3), n of 2 or more")
   length = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
   rod.check_edges(name, length, radius)
-  own = {"young": suture.young, "bend": suture.bend, "twist": suture.twist} | config
+  own = {
+    "young": suture.young,
+    "bend": suture.bend,
+    "twist": suture.twist,
+    "strength": suture.strength[size],
+  } | config
   texts = {key: text(value, 17) for key, value in own.items()} | {"elements": "rod"}
   given = {**CONTACT, "friction": suture.friction, **(contact or {})}
   try:
@@ -128,7 +133,7 @@ class Thread:
   @property
   def tension(self) -> np.ndarray:
     """Tension of each edge [N], (nnode - 1,); negative where it is compressed."""
-    return rod.tension(self._space.constants, self._local())
+    return rod.tension(self._space.constants, self._local(), self.broken)
 
   @property
   def twist(self) -> np.ndarray:
@@ -138,7 +143,12 @@ class Thread:
   @property
   def energy(self) -> float:
     """Elastic energy [J]."""
-    return rod.energy(self._space.constants, self._local(), self.twist)
+    return rod.energy(self._space.constants, self._local(), self.twist, self.broken)
+
+  @property
+  def broken(self) -> np.ndarray:
+    """Whether each edge has broken, (nnode - 1,) bool: its tension was above `strength`."""
+    return self._space.own.broken.numpy()[:-1] > 0
 
   def turn(self, edge: int, angle: float):
     """Turns a clamped edge about itself, from the first to the second of its nodes.

@@ -240,7 +240,7 @@ def show_rod(
 
 @wp.kernel(enable_backward=False)
 def pull_rod(
-  now: wp.array3d[wp.float64], stretch: wp.array[wp.float64], length: wp.array[wp.float64],
+  now: wp.array3d[wp.float64], springs: wp.array2d[wp.float64], broken: wp.array2d[wp.float64],
   out: wp.array2d[float],
 ):  # fmt: skip
   """Writes the tension of a thread's edges."""
@@ -249,7 +249,8 @@ def pull_rod(
   for c in range(3):
     edge = now[w, i + 1, c] - now[w, i, c]
     square += edge * edge
-  out[w, i] = float(stretch[i] * (wp.sqrt(square) - length[i]))
+  whole = wp.float64(1.0) - broken[w, i]
+  out[w, i] = float(whole * springs[0, i] * (wp.sqrt(square) - springs[1, i]))
 
 
 @wp.kernel(enable_backward=False)

@@ -73,6 +73,7 @@ class WorldRods:
   nefc: ints("nworld")
   contact_dim: ints("naconmax")
   contact_flex: Array(wp.vec2i, ("naconmax",))
+  contact_elem: Array(wp.vec2i, ("naconmax",))
   contact_friction: Array(vec5, ("naconmax",))
   # Its rows of constraints:
   type: ints("nworld", "njmax")
@@ -117,10 +118,10 @@ class Thread(base.Thread):
     own_dof[dofs[organ.free]] = 3 * moving + np.arange(3)
     mass = space.mass
     shared = space.constants | rods.settings(organ, space.friction) | {"mass": mass}
-    self.twist, self.force = (
-      wp.zeros((nworld, n, *more), dtype=wp.float64, device=device) for more in ((), (3,))
+    self.twist, self.broken, self.force = (
+      wp.zeros((nworld, n, *more), dtype=wp.float64, device=device) for more in ((), (), (3,))
     )
-    own = {"twist": self.twist, "force": self.force}
+    own = {"twist": self.twist, "force": self.force, "broken": self.broken}
     own["signature"] = wp.zeros((nworld, 1), dtype=wp.float64, device=device)
     each = {
       name: _rows(Rod, name, start, nworld, device) for name, start in rods.scratch(n).items()
@@ -152,17 +153,17 @@ class Thread(base.Thread):
       gravity=m.opt.gravity,
       xfrc_applied=host.float_rows(d.xfrc_applied),
       **{name: getattr(bare, name) for name in ("M_rowadr", "M_rownnz", "M_colind")},
-      **{f"contact_{name}": getattr(d.contact, name) for name in ("dim", "flex", "friction")},
+      **{
+        f"contact_{name}": getattr(d.contact, name) for name in ("dim", "flex", "elem", "friction")
+      },
     )
     for name in WorldRods.vars:
       if name not in values:
         values[name] = getattr(d if hasattr(d, name) else d.efc, name)
     self.fields: Any = fill(WorldRods, device, values)
     self._origin = wp.vec3(*organ.origin)
-    self._springs = [
-      wp.array(space.constants[name], dtype=wp.float64, device=device)
-      for name in ("stretch", "length")
-    ]
+    springs = np.array([space.constants[name] for name in ("stretch", "length")])
+    self._springs = wp.array(springs, dtype=wp.float64, device=device)
 
   def load(self):
     """Loads the kernels, compiling them where the cache has none."""
@@ -206,7 +207,7 @@ class Thread(base.Thread):
   @property
   def tension(self) -> wp.array:
     """Tension of each edge [N], (nworld, nnode - 1)."""
-    inputs = [self.fields.now, *self._springs, self._tension]
+    inputs = [self.fields.now, self._springs, self.broken, self._tension]
     wp.launch(kernels.pull_rod, dim=self._tension.shape, inputs=inputs, device=self._batch.device)
     return self._tension
 
@@ -218,7 +219,8 @@ class Thread(base.Thread):
     data.qpos[organ.qposs] = self._batch.model.qpos0[organ.qposs] + moved
     data.qvel[organ.dofs] = speed[organ.free].ravel()
     own = self._own(data)
-    own.twist[:], own.force[:] = self.twist[world].numpy(), self.force[world].numpy()
+    for name in ("twist", "force", "broken"):
+      getattr(own, name)[:] = getattr(self, name)[world].numpy()
     own.signature[:] = organ.signature
 
   def push(self, world: int, data: mujoco.MjData):
@@ -231,8 +233,8 @@ class Thread(base.Thread):
       if name == "now":
         row[organ.free] -= self._batch.model.qpos0[adr].reshape(-1, 3) - organ.rest[organ.free]
       array[world].assign(row)
-    self.twist[world].assign(own.twist)
-    self.force[world].assign(own.force)
+    for name in ("twist", "force", "broken"):
+      getattr(self, name)[world].assign(getattr(own, name))
 
   def _own(self, data: mujoco.MjData):
     """Returns views of its part of the plugin state."""

@@ -299,6 +299,7 @@ class RodState:
 
   twist: doubles("nvert")  # twist at each node between two edges, 0 at the ends [rad]
   force: doubles("nvert", 3)  # constraint force on each node in the last step [N]
+  broken: doubles("nvert")  # whether an edge has broken
   signature: doubles(1)  # of the thread; 0 where it was set by hand [-]
 
 

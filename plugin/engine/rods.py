@@ -54,6 +54,7 @@ class Rod:
   radius: float  # of its section [m]
   hardness: float  # of its section, of the barrier between edges [N/m]
   friction: float  # of the thread on itself
+  strength: float  # tension at which an edge breaks; 0: none does [N]
   slow: float  # velocity below which friction is viscous [m/s]
   length: doubles("nnode")  # rest length of an edge [m]
   along: doubles("nnode")  # rest length up to a node [m]
@@ -83,7 +84,7 @@ class Rod:
   first: ints("nunknown")  # first column of each row
   start_of_row: ints("nunknown")  # where it is
   below: ints("nunknown")  # scratch
-  status: ints(1)  # iterations, or -1: not finite
+  status: ints(1)  # iterations; -1: not finite; more than `newton`: not solved
   count: ints(3)  # rows of constraints that act on the rod; pairs of edges listed; entries
   smooth: doubles(1)  # velocity below which friction is viscous in this step [m/s]
   reach: doubles(1)  # how far these may be apart before they touch [m]
@@ -224,6 +225,7 @@ def settings(organ: Declaration, friction: float) -> dict:
     radius=organ.radius,
     hardness=_SOFT * float(np.mean(organ.config.young)) * organ.radius,
     friction=friction,
+    strength=organ.config.strength,
     slow=_SLOW,
     held=held.ravel(),
   )
@@ -362,6 +364,11 @@ class Workspace:
     self.report.computed = True
     if self._status[0] < 0:
       self.note("the step has no finite solution: the motion diverged")
+    elif self._status[0] > self.organ.config.iterations:
+      self.note(
+        f"a step was not solved in {self.organ.config.iterations} iterations: its forces are out "
+        "of balance; a smaller time step or more of the key iterations may help"
+      )
 
   def step(self):
     """Ends the step after MuJoCo has moved."""

@@ -109,6 +109,13 @@ class Config:
     "factor on a rod's rigidity against twisting, G J, G = E / (2 (1 + nu)); 0 switches it off; "
     'with `elements="rod"` alone',
   )
+  strength: float = _row(
+    0.0,
+    reading.NOT_NEGATIVE,
+    "tension at which an edge of a rod breaks, the one with the highest first; 0: none does; "
+    'with `elements="rod"` alone',
+    "N",
+  )
   foundation: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
@@ -283,7 +290,8 @@ ROWS: dict[str, Row] = {each.name: each.metadata["row"] for each in dataclasses.
 KEYS = tuple(ROWS)
 RUNNING = tuple(key for key, row in ROWS.items() if row.change)
 MATERIAL = tuple(key for key, row in ROWS.items() if row.change == TISSUE)
-ROD = ("elements", "young", "poisson", "bend", "twist", "iterations")  # all that a rod may have
+# All that a rod may have:
+ROD = ("elements", "young", "poisson", "bend", "twist", "strength", "iterations")
 RECORDED = tuple(key for key, row in ROWS.items() if row.change == GRAPH)
 
 
@@ -407,8 +415,9 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
         raise ValueError(
           f"organ {organ!r}: {key} is set and elements is 'rod', expected {', '.join(ROD)}"
         )
-  elif "twist" in given:
-    raise ValueError(f"organ {organ!r}: twist is set, allowed only with elements='rod'")
+  elif only_rods := {"twist", "strength"} & set(given):
+    key = min(only_rods)
+    raise ValueError(f"organ {organ!r}: {key} is set, allowed only with elements='rod'")
   spring = config.elements == "spring"
   if spring and "stiffness" not in given:
     raise ValueError(f"organ {organ!r}: elements is 'spring' and stiffness is missing [N/m]")

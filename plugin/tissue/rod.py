@@ -52,21 +52,28 @@ def check_apart(name: str, x: np.ndarray, radius: float, between: float, core: f
     )
 
 
-def tension(constants: dict, x: np.ndarray) -> np.ndarray:
-  """Returns the tension of the edges [N], (nnode - 1,), at places x [m], (nnode, 3)."""
+def tension(constants: dict, x: np.ndarray, broken: np.ndarray) -> np.ndarray:
+  """Returns the tension of the edges [N], (nnode - 1,).
+
+  Args:
+    constants: see `constants`
+    x: places [m]                      (nnode, 3)
+    broken: whether an edge has broken (nnode - 1,) bool
+  """
   length = np.linalg.norm(np.diff(x, axis=0), axis=1)
-  return (constants["stretch"][:-1] * (length - constants["length"][:-1])).astype(float)
+  stretch = np.where(broken, 0.0, constants["stretch"][:-1])
+  return (stretch * (length - constants["length"][:-1])).astype(float)
 
 
-def energy(constants: dict, x: np.ndarray, twist: np.ndarray) -> float:
-  """Returns the elastic energy [J] at places x [m], (nnode, 3), and twists [rad], (nnode,)."""
+def energy(constants: dict, x: np.ndarray, twist: np.ndarray, broken: np.ndarray) -> float:
+  """Returns the elastic energy [J], see `tension`, with twists [rad], (nnode,)."""
   edge = np.diff(x, axis=0)
   length = np.linalg.norm(edge, axis=1)
-  stretched = 0.5 * constants["stretch"][:-1] * (length - constants["length"][:-1]) ** 2
+  stretched = 0.5 * tension(constants, x, broken) * (length - constants["length"][:-1])
   e, f = edge[:-1], edge[1:]
   chi = length[:-1] * length[1:] + (e * f).sum(axis=1)
   curvature2 = 4 * (np.cross(e, f) ** 2).sum(axis=1) / chi**2
-  bent = 0.5 * constants["bend"][1:-1] * curvature2
+  bent = 0.5 * np.where(broken[1:] | broken[:-1], 0.0, constants["bend"][1:-1]) * curvature2
   return float(stretched.sum() + bent.sum() + 0.5 * (constants["torsion"] * twist**2).sum())
 
 

@@ -155,3 +155,18 @@ def test_threads_of_a_batch_are_named():
   with pytest.raises(ValueError, match="no thread 'u' in the batch, it has 't'"):
     worlds.thread("u")
   assert worlds.thread("t").xpos.numpy().shape == (2, 5, 3)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_ball_falls_through_a_thread_that_it_breaks(device):
+  world = '<body name="ball" pos=".021 0 .0022"><freejoint/><geom size=".002" mass=".002"/></body>'
+  text = one.document(one.line(21, 0.04), pin=(0, 20), world=world, strength=0.05)
+  model, data, thread, worlds = scene(text, device)
+  run(model, data, worlds, 150)
+  broken = worlds.thread("t").broken.numpy()[:, :-1]
+  np.testing.assert_array_equal(broken, np.tile(thread.broken, (2, 1)))
+  assert broken.sum() == 2
+  height = model.jnt_qposadr[model.body("ball").jntadr[0]] + 2
+  assert (worlds.qpos.numpy()[:, height] < -0.05).all()
+  worlds.reset()
+  assert not worlds.thread("t").broken.numpy().any()

@@ -344,6 +344,62 @@ def test_reset_forgets_twist_and_errors():
   assert np.abs(thread.twist).max() < 1e-6
 
 
+# Breaking.
+
+
+def test_a_thread_breaks_above_its_strength_and_falls_freely():
+  """Where it hangs, since there its own weight adds most; in every state and copy alike."""
+  strength, weight = 0.01, MASS * 9.81
+  model, data, thread = load(
+    line(21, 0.04), pin=(0,), strength=strength, option='gravity="9.81 0 0"'
+  )
+  state, pull = np.zeros(mujoco.mj_stateSize(model, STATE)), 0.9 * (strength - weight)
+  while not thread.broken.any():
+    mujoco.mj_getState(model, data, state, STATE)
+    pull += 1e-5
+    force(model, data, 20, (pull, 0, 0))
+    run(model, data, 1)
+  assert thread.broken.nonzero()[0].tolist() == [0]
+  assert pull + weight * 20.5 / 21 == pytest.approx(strength, rel=0.02)
+  again, copied = mujoco.MjData(model), mujoco.MjData(model)
+  handles = [thread, *(palpate.Thread(model, each, "t") for each in (again, copied))]
+  mujoco.mj_setState(model, again, state, STATE)
+  assert not handles[1].broken.any()
+  force(model, again, 20, (pull, 0, 0))
+  run(model, again, 1)
+  mujoco.mj_copyData(copied, model, again)
+  speed = data.qvel[::3].mean()
+  for each in (data, again, copied):
+    each.qfrc_applied[:] = 0
+    run(model, each, 20)
+    np.testing.assert_array_equal(each.plugin_state, data.plugin_state)
+    np.testing.assert_array_equal(each.qpos, data.qpos)
+  assert data.qvel[::3].mean() == pytest.approx(speed + 0.02 * 9.81, rel=1e-6)
+  assert thread.tension[0] == 0.0 and all(each.broken[0] for each in handles)
+  mujoco.mj_resetData(model, data)
+  assert not thread.broken.any()
+
+
+@pytest.mark.parametrize("strength", [0, 0.05])
+def test_a_ball_falls_through_a_thread_that_it_breaks(strength):
+  """MuJoCo still has the edge that has broken: the parts would hold the ball between them."""
+  world = '<body name="ball" pos=".021 0 .0022"><freejoint/><geom size=".002" mass=".002"/></body>'
+  model, data, thread = load(line(21, 0.04), pin=(0, 20), world=world, strength=strength)
+  for _ in range(150):
+    run(model, data, 1)
+    if data.body("ball").xpos[2] < -0.05:
+      break
+  assert thread.broken.any() == (data.body("ball").xpos[2] < -0.05) == (strength > 0)
+  assert thread.error is None
+
+
+def test_a_step_that_is_not_solved_is_told():
+  model, data, thread = load(line(31, 0.06), pin=(0,), iterations=1, option=FREE)
+  data.qvel[1::3] = np.sin(np.linspace(0, 9, 30))
+  run(model, data, 1)
+  assert "a step was not solved in 1 iterations" in thread.error
+
+
 def test_a_foreign_state_is_refused():
   model, data, thread = load(line(11, 0.02))
   data.plugin_state[:] = 3.0

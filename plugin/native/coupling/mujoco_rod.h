@@ -50,6 +50,16 @@ struct MujocoRod {
     return side_of(contact, CONTACT_FLEX, 0) == f.flex || side_of(contact, CONTACT_FLEX, 1) == f.flex;
   }
 
+  // Makes rows do nothing.
+  PALPATE void empty(Rows rows) const {
+    double* kbip = datum<double*>(f, DATA_EFC_KBIP);
+    for (int r = rows.first; r < rows.first + rows.count; ++r) {
+      const Row row = row_of(f, r);
+      for (int k = 0; k < row.count; ++k) ((double*)row.value)[k] = 0.0;
+      for (int k = 0; k < 4; ++k) kbip[4 * r + k] = 0.0;
+    }
+  }
+
   // Notes the rows of constraints that act on the rod. Contacts are there before they touch, by the flex's
   // margin, which is taken off again: one that came a step late would find light nodes far inside.
   PALPATE void note_rows() const {
@@ -59,6 +69,10 @@ struct MujocoRod {
       const char* contact = contacts + (size_t)CONTACT_LENGTH * c;
       const Rows rows = is_own(contact) ? rows_of(f, contact) : Rows{0, 0, false};
       if (!rows.count) continue;
+      if (is_broken(rod, f.flex, (const int*)(contact + CONTACT_FLEX), (const int*)(contact + CONTACT_ELEM))) {  // MuJoCo still has it
+        empty(rows);
+        continue;
+      }
       keep_closed(f, contact, rows, f.flex_margin.data[f.flex]);
       note_contact(*this, rows.first, rows.count, !rows.paired && rows.count > 1,
                    *(const double*)(contact + CONTACT_MU), (const double*)(contact + CONTACT_FRICTION));

@@ -194,6 +194,29 @@ PALPATE void begin(const Host& host, double h) {
   });
 }
 
+// Whether a contact, of which `flex` and `elem` are the two sides, is one of an edge of the rod that has broken.
+template <class Rod>
+PALPATE bool is_broken(const Rod& rod, int own, const int* flex, const int* elem) {
+  for (int side = 0; side < 2; ++side)
+    if (flex[side] == own && elem[side] >= 0 && !is_whole(rod, elem[side])) return true;
+  return false;
+}
+
+// Breaks the edge with the highest tension at the end of a step, if that is more than it bears.
+template <class Rod>
+PALPATE void break_edge(const Rod& rod) {
+  int weakest = -1;
+  double most = rod.strength;
+  for (int i = 0; i + 1 < rod.nnode && rod.strength > 0.0; ++i) {
+    const double tension = tension_of(rod, rod.place.data, i);
+    if (tension > most) most = tension, weakest = i;
+  }
+  if (weakest < 0) return;
+  rod.own.broken.data[weakest] = 1.0;
+  rod.own.twist.data[weakest] = 0.0;  // of its two nodes
+  rod.own.twist.data[weakest + 1] = 0.0;
+}
+
 // Ends the step: by the rod's own response to what MuJoCo found otherwise.
 template <class Host>
 PALPATE void end(const Host& host, double h) {
@@ -213,7 +236,8 @@ PALPATE void end(const Host& host, double h) {
   }
   const int inner = rod.twists ? rod.nnode - 1 : 0;
   each_lane(1, inner, [&](int i) { rod.trial.data[i] = twist_at(rod, rod.place.data, rod.turn.data, i); });
-  each_lane(1, inner, [&](int i) { rod.own.twist.data[i] = rod.trial.data[i]; });
+  each_lane(1, inner, [&](int i) { rod.own.twist.data[i] = is_joint(rod, i) ? rod.trial.data[i] : 0.0; });
+  one_lane([&] { break_edge(rod); });
   each_lane(0, rod.nnode, [&](int i) {
     if (!host.moves(i)) return;
     store(rod.own.force.data + 3 * i, host.found(i));

@@ -91,6 +91,14 @@ struct WorldRod {
       count = paired ? 2 * (dim - 1) : dim;
       const int* flex = (const int*)f.contact_flex.data + 2 * c;
       if ((flex[0] != f.flex && flex[1] != f.flex) || r + count > nefc) continue;
+      if (is_broken(rod, f.flex, flex, (const int*)f.contact_elem.data + 2 * c)) {  // mujoco_warp still has it
+        for (int k = r; k < r + count; ++k) {
+          const auto own = row(k);
+          for (int a = 0; a < own.count; ++a) own.value[a] = 0.0f;
+          f.aref.data[k] = 0.0f;
+        }
+        continue;
+      }
       const float* friction = (const float*)f.contact_friction.data + 5 * c;
       note_contact(*this, r, count, !paired && count > 1, friction[0] / sqrt(f.impratio), friction);
     }

@@ -16,6 +16,7 @@ constexpr int DOFS = 6;  // of the two nodes that a row reaches
 // Newton's method ends when no node moves by more than this share of the radius.
 constexpr double CLOSE = 1e-5;
 constexpr double SLOPE = 1e-4;  // of a step's decrease, the least (Armijo)
+constexpr double ROUNDED = 1e-15;  // of the cost, what is less than its last digits
 constexpr int HALVINGS = 30;
 
 // What MuJoCo's rows are to their cost: both signs, one, or a cone, whose further rows follow.
@@ -210,7 +211,8 @@ PALPATE void predict(const Fields& f, double h) {
 }
 
 // Takes the step from f.start and f.vel: f.place and f.turn are where it ends, f.predicted the force of
-// the constraints there. Returns how many iterations it took, or -1 where nothing finite was found.
+// the constraints there. Returns how many iterations it took, more than `newton` if it is not solved, or -1 where
+// nothing finite was found.
 template <class Fields>
 PALPATE int step_rod(const Fields& f, double h) {
   const int n = 4 * f.nnode;
@@ -271,9 +273,9 @@ PALPATE int step_rod(const Fields& f, double h) {
     each_lane(0, 3 * f.nnode, [&](int a) { x[a] = trial[a]; });
     each_lane(0, f.nnode, [&](int i) { turn[i] = trial_turn[i]; });
     // A move that was cut short by contacts is not the last one.
-    if (part * most < CLOSE * f.radius && whole == 1.0) return iteration + 1;
+    if ((part * most < CLOSE * f.radius && whole == 1.0) || -falls < ROUNDED * cost) return iteration + 1;
   }
-  return iteration;
+  return f.newton + 1;
 }
 
 }  // namespace palpate

@@ -53,6 +53,20 @@ PALPATE double turned_against(D3 a, D3 b, D3 a1, D3 b1) {
 
 PALPATE D3 tangent(const double* x, int i) { return unit(load(x + 3 * i + 3) - load(x + 3 * i)); }
 
+// Whether an edge is there: not if it has broken.
+template <class Fields>
+PALPATE bool is_whole(const Fields& f, int edge) { return f.own.broken.data[edge] == 0.0; }
+
+// Whether a node inside bends and twists.
+template <class Fields>
+PALPATE bool is_joint(const Fields& f, int i) { return is_whole(f, i - 1) && is_whole(f, i); }
+
+template <class Fields>
+PALPATE double tension_of(const Fields& f, const double* x, int edge) {
+  if (!is_whole(f, edge)) return 0.0;
+  return f.stretch.data[edge] * (norm(load(x + 3 * edge + 3) - load(x + 3 * edge)) - f.length.data[edge]);
+}
+
 // The twist at a node inside, with edges turned by `turn` since the step began.
 template <class Fields>
 PALPATE double twist_at(const Fields& f, const double* x, const double* turn, int i) {
@@ -67,8 +81,8 @@ PALPATE double rod_energy(const Fields& f, const double* x, const double* turn) 
   double sum = 0.0;
   each_lane(0, f.nnode - 1, [&](int i) {
     const double longer = norm(load(x + 3 * i + 3) - load(x + 3 * i)) - f.length.data[i];
-    sum += 0.5 * f.stretch.data[i] * longer * longer;
-    if (!i) return;
+    if (is_whole(f, i)) sum += 0.5 * f.stretch.data[i] * longer * longer;
+    if (!i || !is_joint(f, i)) return;
     const D3 k = bent(x, i).curvature;
     sum += 0.5 * f.bend.data[i] * dot(k, k);
     if (f.twists) {
@@ -149,6 +163,7 @@ PALPATE void add_twist(const Fields& f, const Bent& b, int i, double twist, doub
 template <class Fields>
 PALPATE void add_rod(const Fields& f, const double* x, const double* turn, double* g, const RodMatrix& H, bool exact) {
   each_apart<2>(0, f.nnode - 1, [&](int i) {
+    if (!is_whole(f, i)) return;
     const D3 e = load(x + 3 * i + 3) - load(x + 3 * i);
     const double l = norm(e) + 1e-300, k = f.stretch.data[i], tension = k * (l - f.length.data[i]);
     const double w[2] = {-1.0, 1.0}, across = exact || tension > 0.0 ? tension / l : 0.0;
@@ -159,6 +174,7 @@ PALPATE void add_rod(const Fields& f, const double* x, const double* turn, doubl
     terms.scatter(node, g, H);
   });
   each_apart<3>(1, f.nnode - 1, [&](int i) {
+    if (!is_joint(f, i)) return;
     // The energy is 2 B t^2, t the tangent of half the angle between the edges: in their plane a function
     // of that angle, across it of how they turn against each other and with each other.
     const Bent b = bent(x, i);

@@ -75,16 +75,19 @@ PALPATE bool list_near(const Fields& f, const double* x) {
   const int n = f.nnode;
   int count = 0;
   const double far = 2.0 * f.radius + f.reach.data[0], reach = far + f.longest;
+  bool whole = true;
+  for (int i = 0; i + 1 < n; ++i) whole = whole && is_whole(f, i);
   for (int i = 0; i + 1 < n; ++i) {
+    if (!is_whole(f, i)) continue;
     const D3 a = 0.5 * (load(x + 3 * i) + load(x + 3 * i + 3));
     const double beyond = f.along.data[i + 1] + NEIGHBOURS * f.radius;
     for (int j = i + 2, skip; j + 1 < n && f.collides; j += skip) {
       skip = 1;
-      if (f.along.data[j] < beyond) continue;
+      if (f.along.data[j] < beyond || !is_whole(f, j)) continue;
       const D3 b = 0.5 * (load(x + 3 * j) + load(x + 3 * j + 3));
       const double d2 = dot(a - b, a - b);
       if (d2 > reach * reach) {  // so are all edges up to where the thread could be back
-        skip = 1 + (int)((sqrt(d2) - reach) / (STRETCHED * f.longest));
+        if (whole) skip = 1 + (int)((sqrt(d2) - reach) / (STRETCHED * f.longest));
         continue;
       }
       const D3 off = nearest_edges(x, i, j).off;
