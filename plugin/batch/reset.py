@@ -59,7 +59,8 @@ class Rest:
     for thread in batch.rods.all.values():
       f = thread.fields
       self.starts += [_start(f.now, thread.declared.rest)]
-      self.starts += [_start(array) for array in (f.speed, thread.twist, thread.force, thread.broken)]
+      own = f.speed, thread.twist, thread.force, thread.broken
+      self.starts += [_start(array) for array in own]
     self._rows = self.starts + [_start(array) for array in zero if array.size]
     self._move = move = kernels.Move()
     for name in kernels.Move.vars:

@@ -43,7 +43,8 @@ _CLASS_I = {"3-0": 0.96 * _G, "4-0": 0.60 * _G, "5-0": 0.40 * _G}
 # The moduli of silk and polyglactin 910 (of its fast form) are those of straight threads of size
 # 3-0 by Naleway et al. 2015. That of polypropylene, the friction, which is no constant but falls
 # with tension, and is higher of braids (Surg Gynecol Obstet 161 (1985), 12-16), and how much less a
-# braid resists bending than a solid rod, since its fibres slide, are estimates. Densities are those of the materials.
+# braid resists bending than a solid rod, since its fibres slide, are estimates. Densities are those
+# of the materials.
 SUTURES: Mapping[str, Suture] = {
   "vicryl": Suture(9.3e9, 0.02, 0.02, 1500.0, 0.2, _ABSORBABLE),  # polyglactin 910, braided
   "silk": Suture(8.7e9, 0.02, 0.02, 1330.0, 0.3, _CLASS_I),  # braided

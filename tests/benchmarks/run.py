@@ -20,6 +20,7 @@ BENCHES = {
   "flex": "batches beside mujoco_warp's own flex on the same device",
   "flicker": "steps without force while a probe presses the organs that ship",
   "inertia": "what the effective inertia does to the contact force",
+  "knots": "threads in knots: does anything go through, what holds, what edges cost",
   "learning": "what an agent learns of the exercises from random weights",
   "live": "how punctual a live loop is while a page shows it, and how late its pictures are",
   "locality": "what leaving out solved nodes would save",

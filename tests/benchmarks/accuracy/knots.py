@@ -1,0 +1,187 @@
+"""Knots in threads: does anything go through, what holds, and what do edges cost?
+
+Random tangles are pulled tight by 0.5 N, and the Jones polynomial of the thread, closed far away,
+must be what it was; it is not decided where part of the thread came before a hand, or has too
+many crossings. Knots are drawn tight by 2 N at all four strands, the ends are let go, and the
+strands are pulled apart by up to 80 % of the thread's strength. An overhand knot is drawn tight by
+0.5 N with edges of 2 to 5 radii. Times are of `mj_step`, in CPU time, without the first 20 steps,
+in which the thread, straight at rest, springs from the curve that it was drawn on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import time
+
+import mujoco
+import numpy as np
+import scenes.threads as scene
+from benchmarks import plots, results
+from benchmarks.runner import Bench, Case, Row
+from palpate import register
+from palpate.tasks.metrics import knots
+
+TANGLES, EACH = 1000, 20  # of a case
+KNOTS = ((1,), (1, 1), (1, -1), (2, -1), (2, -1, 1))
+MATERIALS = ("silk", "vicryl", "polypropylene")
+FRICTIONS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4)  # of silk on itself
+SEGMENTS = (2.0, 2.5, 3.0, 4.0, 5.0)  # [radii]
+_START = 20  # steps
+_COLUMNS = (
+  *("kind", "seed", "knot", "material", "friction", "segment", "nodes", "decided", "same", "near"),
+  *("error", "held", "slip_mm", "kept_mm", "median_ms", "high_ms"),
+)
+
+
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns tangles, knots and edge lengths."""
+  short = args.short
+  count, each = (4, 2) if short else (TANGLES, EACH)
+  tangles = [
+    {"case": f"tangles {k}", "kind": "tangle", "seed": k, "count": each}
+    for k in range(0, count, each)
+  ]
+  pulls = [
+    {"case": f"{material} {turns}", "kind": "pull", "turns": " ".join(map(str, turns)),
+     "material": material, "friction": 0.0}
+    for material in MATERIALS[: 1 if short else None]
+    for turns in KNOTS[: 1 if short else None]
+  ]  # fmt: skip
+  pulls += [
+    {"case": f"square {friction}", "kind": "pull", "turns": "1 -1", "material": "silk",
+     "friction": friction}
+    for friction in (() if short else FRICTIONS)
+  ]  # fmt: skip
+  edges = [
+    {"case": f"edges {segment:g}", "kind": "edge", "segment": segment}
+    for segment in SEGMENTS[-1 if short else 0 :]
+  ]
+  return [edges, pulls + tangles]
+
+
+def _timed(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+  """Takes a step and returns its time [ms]."""
+  start = time.thread_time()
+  mujoco.mj_step(model, data)
+  return 1e3 * (time.thread_time() - start)
+
+
+def _times(took: list[float]) -> dict:
+  counted = took[_START:]
+  return {"median_ms": float(np.median(counted)), "high_ms": float(np.percentile(counted, 99))}
+
+
+def tangle(seed: int) -> Row:
+  """Pulls a tangle tight and returns what became of it."""
+  points = scene.tangle(seed, 4 * scene.RADIUS)
+  before, took, nearest = knots.jones(knots.closed(points)), [], []
+
+  def step(model: mujoco.MjModel, data: mujoco.MjData):
+    took.append(_timed(model, data))
+
+  thread, clear = scene.by_hands(points, 0.5, 250, step, bend=1e-4)
+  nearest = scene.nearest(thread.positions) / scene.RADIUS
+  after = knots.jones(knots.closed(thread.positions))
+  decided = bool(clear and before is not None and after is not None)
+  return {
+    "kind": "tangle", "seed": seed, "nodes": len(points), "decided": int(decided),
+    "same": int(before == after) if decided else "", "near": nearest, "error": thread.error or "",
+    **_times(took),
+  }  # fmt: skip
+
+
+def pull(turns: tuple[int, ...], material: str, friction: float) -> Row:
+  """Pulls a knot and returns what held."""
+  took: list[float] = []
+  contact = {"friction": friction} if friction else None
+  held, slip, thread = scene.pull_test(
+    turns, material, step=lambda m, d: took.append(_timed(m, d)), contact=contact
+  )
+  return {
+    "kind": "pull", "knot": knots.NAMES.get(turns, str(turns)), "material": material,
+    "friction": friction or "", "segment": 2.5, "nodes": len(thread.positions), "held": held,
+    "slip_mm": 1e3 * slip, "error": thread.error or "", **_times(took),
+  }  # fmt: skip
+
+
+def edge(segment: float) -> Row:
+  """Draws an overhand knot tight and returns how much thread it keeps."""
+  points = scene.overhand(0.0012, segment * scene.RADIUS, 0.012)
+  took: list[float] = []
+  thread, _ = scene.by_hands(points, 0.5, 400, lambda m, d: took.append(_timed(m, d)))
+  kept = thread.length - np.linalg.norm(thread.positions[-1] - thread.positions[0])
+  return {
+    "kind": "edge", "segment": segment, "nodes": len(points), "kept_mm": 1e3 * kept,
+    "error": thread.error or "", **_times(took),
+  }  # fmt: skip
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the rows of a case."""
+  register()
+  if case["kind"] == "tangle":
+    return [tangle(seed) for seed in range(case["seed"], case["seed"] + case["count"])]
+  if case["kind"] == "edge":
+    return [edge(case["segment"])]
+  turns = tuple(map(int, str(case["turns"]).split()))
+  return [pull(turns, case["material"], case["friction"])]
+
+
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  tangles = [r for r in rows if r["kind"] == "tangle"]
+  decided = [r for r in tangles if r["decided"]]
+  same = sum(r["same"] for r in decided)
+  held = [f"{r['knot']} {r['held']:.0%}" for r in rows if r["kind"] == "pull"
+          and r["material"] == "silk" and not r["friction"]]  # fmt: skip
+  lines = [
+    f"Of {len(tangles)} tangles pulled tight {len(decided)} are decided, and {same} of these keep "
+    "their knot."
+  ]
+  if held:
+    lines.append(
+      f"In silk hold, as shares of the strength (80 % is all that was tried): {', '.join(held)}."
+    )
+  return lines
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+  good = [r for r in rows if r["status"] == "ok"]
+  by = {kind: [r for r in good if r["kind"] == kind] for kind in ("tangle", "pull", "edge")}
+  pulls = [
+    [r["knot"], r["material"], f"{r['friction'] or '-'}", f"{r['held']:.2f}", f"{r['slip_mm']:.1f}",
+     f"{r['median_ms']:.2f}", f"{r['high_ms']:.1f}"]
+    for r in by["pull"]
+  ]  # fmt: skip
+  edges = [
+    [f"{r['segment']:g}", str(r["nodes"]), f"{r['kept_mm']:.2f}", f"{r['median_ms']:.2f}",
+     f"{r['high_ms']:.1f}"]
+    for r in by["edge"]
+  ]  # fmt: skip
+  times = ["median [ms]", "99 % [ms]"]
+  head = ["knot", "material", "friction, if not its own", "held", "came out [mm]", *times]
+  lines = [str(__doc__).partition("\n\n")[2], "", *plots.table(head, pulls), ""]
+  head = ["edge [radii]", "nodes", "kept in the knot [mm]", *times]
+  lines += [*plots.table(head, edges), ""]
+  unsolved = sum("not solved" in r["error"] for r in by["tangle"])
+  other = sum(bool(r["error"]) for r in by["tangle"]) - unsolved
+  lost = [str(r["seed"]) for r in by["tangle"] if r["decided"] and not r["same"]]
+  lines += [
+    f"Steps that were not solved to the end are in {unsolved} tangles, other errors in {other}. "
+    f"Changed knots: {', '.join(lost) or 'none'}.",
+    "",
+    results.link(out / "knots.csv"),
+  ]
+  panels: dict = {
+    "overhand knot": {
+      f"{r['segment']:g} radii": ([r["median_ms"]], [r["kept_mm"]]) for r in by["edge"]
+    }
+  }
+  title = "Thread kept in an overhand knot, by the time of a step"
+  picture = plots.curves(out / "knots.png", title, panels, "median step [ms]", "kept [mm]")
+  return [picture, results.page(out / "knots.md", "Knots", about, lines, finding(good), picture)]
+
+
+BENCH = Bench("knots", stages, run, columns=_COLUMNS, report=report, jobs=4)

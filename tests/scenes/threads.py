@@ -1,0 +1,199 @@
+"""Threads in knots and tangles, and hands that pull them."""
+
+import mujoco
+import numpy as np
+import palpate
+from palpate.tasks.metrics import knots
+from palpate.tissue.sutures import DIAMETER, SUTURES
+
+RADIUS, YOUNG, DENSITY = 1.125e-4, 8.7e9, 1330.0  # silk 3-0
+BEND = 0.02
+
+
+def resampled(curve, segment):
+  """Returns points along a curve, `segment` apart [m]."""
+  along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
+  at = np.linspace(0, along[-1], int(along[-1] / segment) + 1)
+  return np.stack([np.interp(at, along, c) for c in curve.T], axis=1)
+
+
+def with_tails(curve, tail):
+  """Returns a curve that goes on straight at both ends."""
+  first, last = curve[0] - curve[1], curve[-1] - curve[-2]
+  ahead = np.linspace(0, tail, 50)[1:, None]
+  first, last = (ahead * (v / np.linalg.norm(v)) for v in (first, last))
+  return np.concatenate([(curve[0] + first)[::-1], curve, curve[-1] + last])
+
+
+def overhand(size, segment, tail):
+  """Shastri's polynomial knot, Tohoku Mathematical Journal 44 (1992): an overhand knot."""
+  t = np.linspace(-2.1, 2.1, 2001)
+  curve = size * np.stack([t**3 - 3 * t, t**4 - 4 * t**2, (t**5 - 10 * t) / 5], axis=1)
+  return resampled(with_tails(curve, tail), segment)
+
+
+def tangle(seed, segment):
+  """A random smooth curve, no nearer to itself than it is thick, between straight ends."""
+  rng = np.random.RandomState(seed)
+  t = np.linspace(0, 1, 1500)[:, None]
+  while True:
+    k = np.arange(1, 9)
+    waves = rng.normal(size=(2, 8, 3)) / k[:, None] ** 0.2
+    curve = np.einsum("tk,kc->tc", np.sin(2 * np.pi * t * k), waves[0])
+    curve += np.einsum("tk,kc->tc", np.cos(2 * np.pi * t * k), waves[1])
+    window = np.minimum(1.0, 8 * np.sin(np.pi * t))
+    curve = 0.001 * window * curve + np.array([0.004, 0, 0]) * (t - 0.5)
+    ends = np.linspace(0.0, 0.015, 60)[1:, None] * (1, 0, 0)
+    points = resampled(np.concatenate([(curve[0] - ends)[::-1], curve, curve[-1] + ends]), segment)
+    if nearest(points) > 2.3 * RADIUS:
+      return points
+
+
+def nearest(points, between=2):
+  """Returns how near the middles of edges come that are no neighbours, less half an edge [m]."""
+  middle = 0.5 * (points[1:] + points[:-1])
+  i, j = np.triu_indices(len(middle), between)
+  far = np.linalg.norm(middle[i] - middle[j], axis=1)
+  return far.min()
+
+
+def load(points, hands=(), h=1e-3, damping=2.0, **config):
+  """Returns a thread, some nodes of which are in hands: 20 g on a slide with a motor each.
+
+  Args:
+    points: its nodes [m]  (n, 3)
+    hands: of each its node and the direction of its slide
+    h: time step [s]
+    damping: of the slides [N s/m]
+    **config: see `palpate.add_thread`
+  """
+  spec = mujoco.MjSpec()
+  spec.option.gravity, spec.option.timestep = (0, 0, 0), h
+  palpate.add_thread(spec, points, "t", **config)
+  for k, (node, way) in enumerate(hands):
+    name = f"hand_{k}"
+    hand = spec.worldbody.add_body(name=name, pos=points[node])
+    hand.add_geom(size=[0.003, 0, 0], mass=0.02, contype=0, conaffinity=0)
+    hand.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=way, damping=damping)
+    motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    motor.set_to_motor()
+    spec.add_equality(
+      type=mujoco.mjtEq.mjEQ_CONNECT,
+      objtype=mujoco.mjtObj.mjOBJ_BODY,
+      name1=name,
+      name2=f"t_{node}",
+      solref=[0.002, 1],
+    )
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  return model, data, palpate.Thread(model, data, "t")
+
+
+def by_hands(points, force, steps, step=mujoco.mj_step, **config):
+  """Returns a thread whose ends hands have pulled apart, and whether none of it came before a hand.
+
+  There an open thread is closed for its knot: what goes by a hand changes that, and rightly so.
+  """
+  axis = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
+  model, data, thread = load(points, ((0, -axis), (len(points) - 1, axis)), **config)
+  places, clear = thread.positions, True
+  for k in range(steps):
+    data.ctrl[:] = force * min(1.0, k / 50)
+    step(model, data)
+    before, places = places, thread.positions
+    moved = np.linalg.norm(places - before, axis=1).max()
+    for end, way in ((places[0], -axis), (places[-1], axis)):
+      ahead = (places - end) @ way
+      off = np.linalg.norm(places - end - ahead[:, None] * way, axis=1)
+      edge = np.linalg.norm(points[1] - points[0])
+      clear &= not ((ahead > edge) & (off < 2 * moved + edge)).any()
+  return thread, clear
+
+
+def throws(turns, radius, segment, ear=5e-3, arm=5e-3):
+  """Returns a thread tied loosely: two strands in throws one above the other, joined by a bow.
+
+  In a throw of k turns the strands wind about each other by 2 k + 1 half turns. They come out at
+  its top, the other way round, and are the strands of the next.
+
+  Args:
+    turns: of each throw, negative where left-handed
+    radius: of the thread [m]
+    segment: length of an edge [m]
+    ear: length of the free ends [m]
+    arm: how far from the knot the bow begins [m]
+
+  Returns:
+    nodes [m] (n, 3), and the nodes at which the bow begins and ends
+  """
+  wide, pitch, up = 1.6 * radius, 10 * radius, 12.8 * radius
+  strands = [], []
+  for level, k in enumerate(turns):
+    half = 2 * abs(k) + 1
+    u = np.linspace(0, 1, 60 * half)
+    angle = np.sign(k) * np.pi * half * u
+    x, z = 0.5 * pitch * half * (u - 0.5), level * up
+    y, high = wide * np.sin(angle), wide * np.cos(angle)
+    to_right, to_left = (np.stack([x, s * y, z - s * high], axis=1) for s in (1, -1))
+    if level % 2:
+      strands[0].append(to_left[::-1])
+      strands[1].append(to_right)
+    else:
+      strands[0].append(to_right)
+      strands[1].append(to_left[::-1])
+  left, right = (np.concatenate(each) for each in strands)  # by where they begin
+  left, right = (
+    np.concatenate([each, each[-1:] + ear * np.array([[np.sign(each[-1, 0]), 0, 0.1]])])
+    for each in (left, right)
+  )
+  t = np.linspace(np.pi, 2 * np.pi, 60)
+  bow = np.stack([arm * np.cos(t), 0 * t, left[0, 2] + arm * np.sin(t)], axis=1)
+  share = np.linspace(0, 1, 20)[1:-1, None]
+  joins = [left[:1] + share * (bow[:1] - left[:1]), bow[-1:] + share * (right[:1] - bow[-1:])]
+  points = resampled(np.concatenate([left[::-1], joins[0], bow, joins[1], right]), segment)
+  return points, *(int(np.linalg.norm(points - at, axis=1).argmin()) for at in bow[[0, -1]])
+
+
+def pull_test(
+  turns, material="silk", size="3-0", segment=2.5, set_by=2.0, most=0.8, step=mujoco.mj_step,
+  **config,
+):  # fmt: skip
+  """Ties a knot, draws it tight by all four strands, lets the ends go, and pulls the bow's apart.
+
+  Args:
+    turns: see `throws`
+    material: of the thread
+    size: of the thread
+    segment: length of an edge, in radii
+    set_by: force that the knot is drawn tight with [N]
+    most: of the pull, as a share of the thread's strength
+    step: takes a step of a model and its data
+    **config: see `palpate.add_thread`
+
+  Returns:
+    what held [N], a share of the strength; how far the strands came out of the knot [m]; the thread
+  """
+  radius, strength = 0.5 * DIAMETER[size], SUTURES[material].strength[size]
+  points, first, last = throws(turns, radius, segment * radius)
+  nodes = first, last, 0, len(points) - 1
+  hands = [(node, (np.sign(points[node, 0]), 0, 0)) for node in nodes]
+  model, data, thread = load(
+    points, hands, damping=20.0, material=material, size=size, strength=0, **config
+  )
+  at = [model.joint(f"hand_{k}").qposadr[0] for k in (0, 1)]
+  for k in range(300):
+    data.ctrl[:] = set_by * min(1.0, k / 200)
+    step(model, data)
+  for k in range(100):
+    data.ctrl[2:] = set_by * (1 - k / 100)
+    step(model, data)
+  data.eq_active[2:] = 0
+  start, force, slip = data.qpos[at].sum(), set_by, 0.0
+  for k in range(500):
+    force = set_by + (most * strength - set_by) * min(1.0, k / 400)
+    data.ctrl[:2] = force
+    step(model, data)
+    slip = data.qpos[at].sum() - start
+    if k % 20 == 0 and knots.throws(knots.closed(thread.positions, np.array([1.0, 0, 0]))) == ():
+      return force / strength, slip, thread
+  return force / strength, slip, thread
