@@ -59,6 +59,7 @@ REFUSED = [
   ("skin", "two words", "the name of a skin"),
   ("tear", "-0.1", "a number >= 0"),
   ("cutters", "a b c 160", "a geom, or two of scissors, and an energy > 0"),
+  ("needles", "needle -800", "a body, an energy > 0"),
   ("spare", "-1", "a whole number >= 0 or 'auto'"),
   ("spare", "some", "a whole number >= 0 or 'auto'"),
   ("resident", "yes", "'true' or 'false'"),
