@@ -44,13 +44,15 @@ def tangle(seed, segment):
     window = np.minimum(1.0, 8 * np.sin(np.pi * t))
     curve = 0.001 * window * curve + np.array([0.004, 0, 0]) * (t - 0.5)
     ends = np.linspace(0.0, 0.015, 60)[1:, None] * (1, 0, 0)
-    points = resampled(np.concatenate([(curve[0] - ends)[::-1], curve, curve[-1] + ends]), segment)
-    if nearest(points) > 2.3 * RADIUS:
+    curve = np.concatenate([(curve[0] - ends)[::-1], curve, curve[-1] + ends])
+    points = resampled(curve, segment)
+    near = nearest(points) < 2.3 * RADIUS
+    if not near and nearest(resampled(curve, RADIUS), between=8) > 1.6 * RADIUS:
       return points
 
 
 def nearest(points, between=2):
-  """Returns how near the middles of edges come that are no neighbours, less half an edge [m]."""
+  """Returns how near the middles of edges come that are `between` or more apart [m]."""
   middle = 0.5 * (points[1:] + points[:-1])
   i, j = np.triu_indices(len(middle), between)
   far = np.linalg.norm(middle[i] - middle[j], axis=1)
