@@ -71,6 +71,11 @@ class Worlds(Batch):
       for number in instances(model, dim=1).values()
     ]
     host.check(spaces.values())
+    if sewn and model.opt.solver != mujoco.mjtSolver.mjSOL_NEWTON:
+      kind = mujoco.mjtSolver(model.opt.solver).name.removeprefix("mjSOL_")
+      raise ValueError(
+        f"thread {sewn[0].organ.name!r}: solver is {kind}, expected Newton in a batch on a GPU"
+      )
     tools = [strip_organs.tools_of(model, organ) for organ in declared]
     threads = [w.organ for w in sewn]
     lines = [strip_organs.lines_of(model, organ, threads) for organ in declared]

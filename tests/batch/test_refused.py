@@ -7,6 +7,7 @@ import sys
 
 import mujoco
 import numpy as np
+import palpate
 import palpate.batch
 import pytest
 import warp as wp
@@ -55,6 +56,14 @@ def test_a_force_that_is_not_over_rows_of_worlds(monkeypatch):
   monkeypatch.setitem(FORCES, "tide", Tide)  # one that somebody adds, for one world
   with pytest.raises(ValueError, match="organ 'organ': tide is set, which a batch on a GPU cannot"):
     make(press(subdivisions=1))
+
+
+def test_a_thread_with_another_solver():
+  spec = mujoco.MjSpec()
+  palpate.add_thread(spec, np.linspace((0, 0, 0), (0.02, 0, 0), 9), "t")
+  spec.option.solver = mujoco.mjtSolver.mjSOL_CG
+  with pytest.raises(ValueError, match="thread 't': solver is CG, expected Newton in a batch"):
+    make(spec)
 
 
 def test_tissues_of_worlds_without_a_gpu_to_step_them():

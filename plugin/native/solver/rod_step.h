@@ -121,8 +121,14 @@ PALPATE double rows_cost(const Fields& f, const double* x, double h, double* g, 
     cost += 0.5 * row.D() * residual * residual;
     if (g) add_row(f, row.node(), row.J(), row.D() * residual, row.D() / (h * h), g, H);
   };
-  if (!g) each_lane(0, n, add);
-  if (g) one_lane([&] { for (int r = 0; r < n; ++r) add(r); });
+  if (!g || TOGETHER == 1) {
+    each_lane(0, n, add);
+  } else {  // by the nodes that they reach; those of the last one have the one before as well
+    each_apart<3>(0, f.nnode, [&](int i) {
+      for (int r = 0; r < n; ++r)
+        if (f.row_node.data[r] == i) add(r);
+    });
+  }
   return cost;
 }
 
