@@ -99,7 +99,10 @@ def test_more_worlds_than_memory():
 
 
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp knows no CUDA")
-@pytest.mark.parametrize("which", ["patch", "contacts", "whole"])
+@pytest.mark.parametrize(
+  "which",
+  ["patch", "world_contacts", pytest.param("world_rods", marks=pytest.mark.slow), "whole"],
+)
 def test_the_kernels_compile_for_cuda(tmp_path, scenes, which):
   from palpate.batch import patch
   from palpate.tissue import device, kernels, step
@@ -111,8 +114,8 @@ def test_the_kernels_compile_for_cuda(tmp_path, scenes, which):
     body.plan = device.Plan(own=2, threads=160, per_sm=2, nbytes=0, whole=True, **kinds)
     (kernel,) = step.kernels(body)
   module = kernel.cuda.module
-  if which == "contacts":
-    (module,) = (name for name in kernels.MODULES["cuda"] if "world_contacts" in name)
+  if which.startswith("world"):
+    (module,) = (name for name in kernels.MODULES["cuda"] if which in name)
   wp.compile_aot_module(module, arch=90, module_dir=str(tmp_path), use_ptx=True)
   assert any(tmp_path.iterdir())
 
