@@ -3,8 +3,9 @@
 
 The teacher says in every world what it would do, whoever acts: in a share of the worlds the student
 alone, elsewhere both by turns (Ross, Gordon and Bagnell 2011, 10.48550/arXiv.1011.0686; a teacher
-that sees more: Chen et al. 2019, 10.48550/arXiv.1912.12294). The student's memory has to tell what
-the teacher sees and it does not, too: so its encoder learns where to look long before it acts well.
+that sees more: Chen et al. 2019, 10.48550/arXiv.1912.12294). From what the student senses and
+remembers it has to tell what the teacher sees and it does not, too: so its encoder learns where to
+look long before it acts well.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from .networks import ACTING, FINE, MORE, Networks
 from .sight import PICTURES
 
 TEACHER = "teacher"  # group of observations
-STEPS = 64  # control steps of an iteration
+STEPS = 32  # control steps of an iteration
 UPDATES, WORLDS = 32, 64  # steps of the optimiser of an iteration, and worlds of each
-_KEPT = 4  # iterations that are learned from
+_KEPT = 8  # iterations that are learned from
 _ALONE = 1 / 3  # share of worlds where the student acts alone, once it acts
 _TURN = 40  # control steps of a turn elsewhere, in the mean
 _ACTS, _LEAST = 0.4, 0.2  # share of the training after which the teacher acts least, and how often
@@ -71,7 +72,8 @@ class Distillation(Student):
     made.take(teacher)
     self._teacher = made.actor
     super().__init__(env, settings, networks)
-    self._guess = torch.nn.Linear(settings.memory, sum(sizes.values())).to(device)
+    seen = networks.actor.rnn.rnn.input_size + settings.memory
+    self._guess = torch.nn.Linear(seen, sum(sizes.values())).to(device)
     share = [1.0 / (len(sizes) * size) for size in sizes.values() for _ in range(size)]
     self._share = torch.tensor(share, device=device)
     parts = [networks.actor.encoder, networks.actor.rnn, networks.actor.mlp, self._guess]
@@ -158,11 +160,14 @@ class Distillation(Student):
     worlds = torch.randint(count, (min(WORLDS, count),), generator=self._random, device=device)
     part = {name: rows[:, worlds] for name, rows in self._kept[which].items() if name != "state"}
     networks, actor = self.networks, self.networks.actor
-    latent = self._remember(part, self._kept[which]["state"][worlds])
+    told = actor.sense(part)
+    latent = self._remember(told, part["begun"], self._kept[which]["state"][worlds])
     error = networks.error(latent, part["says"], torch.ones_like(part["begun"]))
     known = networks.critic.obs_normalizer(torch.cat([part[ACTING], part[MORE]], dim=-1))
     more = known[..., part[ACTING].shape[-1] :].clamp(-10.0, 10.0)
-    guess = smooth_l1_loss(self._guess(latent), more, beta=FINE, reduction="none")
+    guess = smooth_l1_loss(
+      self._guess(torch.cat([told, latent], dim=-1)), more, beta=FINE, reduction="none"
+    )
     loss = error + (guess @ self._share).mean()
     self.optimiser.zero_grad()
     loss.backward()
@@ -170,12 +175,12 @@ class Distillation(Student):
     self.optimiser.step()
     return loss.detach()
 
-  def _remember(self, part: Mapping[str, torch.Tensor], state: torch.Tensor) -> torch.Tensor:
+  def _remember(self, told: torch.Tensor, begun: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
     """Returns the actor's memory in each step, beginning with a state; an episode has its own."""
-    gru, told = self.networks.actor.rnn.rnn, self.networks.actor.sense(part)
+    gru = self.networks.actor.rnn.rnn
     weights = gru.weight_ih_l0, gru.weight_hh_l0, gru.bias_ih_l0, gru.bias_hh_l0
     states = []
-    for x, begun in zip(told, part["begun"], strict=True):
-      state = torch.gru_cell(x, state * (1.0 - begun)[:, None], *weights)
+    for x, begins in zip(told, begun, strict=True):
+      state = torch.gru_cell(x, state * (1.0 - begins)[:, None], *weights)
       states.append(state)
     return torch.stack(states)

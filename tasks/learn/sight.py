@@ -50,10 +50,12 @@ class Encoder(nn.Module):
   def forward(self, pixels: torch.Tensor) -> torch.Tensor:
     """Returns what it says of pictures (..., 3 height width) of bytes  (..., SAID)."""
     x = pixels.reshape(-1, *self.size, 3).permute(0, 3, 1, 2).float() / 255.0 - 0.5
-    for k, layer in enumerate(self.convolutions):
-      x = layer(x.relu() if k else x)
+    learns = x.is_cuda and torch.is_grad_enabled()  # half the memory and the time
+    with torch.autocast(x.device.type, torch.bfloat16, enabled=learns):
+      for k, layer in enumerate(self.convolutions):
+        x = layer(x.relu() if k else x)
     height, width = x.shape[2:]
-    flat = x.flatten(2)
+    flat = x.flatten(2).float()
     share = flat.softmax(dim=2)
     axes = [torch.linspace(-1.0, 1.0, n, device=x.device) for n in (width, height)]
     across, down = axes[0].repeat(height), axes[1].repeat_interleave(width)
