@@ -33,6 +33,33 @@ _ALONE = 1 / 3  # share of worlds where the student acts alone, once it acts
 _TURN = 40  # control steps of a turn elsewhere, in the mean
 _ACTS, _LEAST = 0.4, 0.2  # share of the training after which the teacher acts least, and how often
 _RATE, _SLOWEST = 1e-3, 0.03  # learning rate, and share of it at the end
+_LIGHT = 0.1  # by how much each colour of a picture varies that is learned from [-]
+_WARM = 3  # times that work is done before it is recorded
+
+
+class Recorded:
+  """Work on tensors that keep their shapes: small kernels, which a GPU replays as one graph."""
+
+  def __init__(self, work: Callable[[dict[str, torch.Tensor]], torch.Tensor]):
+    """Takes the work; nothing in it may wait for the device."""
+    self._work, self._graph = work, None
+
+  def __call__(self, part: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Does the work with tensors by name; what it returns keeps its place."""
+    if self._graph is None:
+      self._part, here, aside = part, torch.cuda.current_stream(), torch.cuda.Stream()
+      aside.wait_stream(here)
+      with torch.cuda.stream(aside):
+        for _ in range(_WARM):
+          self._work(part)
+      here.wait_stream(aside)
+      self._graph = torch.cuda.CUDAGraph()
+      with torch.cuda.graph(self._graph):
+        self._found = self._work(part)
+    for name, values in part.items():
+      self._part[name].copy_(values)
+    self._graph.replay()
+    return self._found
 
 
 class Distillation(Student):
@@ -77,7 +104,13 @@ class Distillation(Student):
     share = [1.0 / (len(sizes) * size) for size in sizes.values() for _ in range(size)]
     self._share = torch.tensor(share, device=device)
     parts = [networks.actor.encoder, networks.actor.rnn, networks.actor.mlp, self._guess]
-    self.optimiser = torch.optim.Adam([p for part in parts for p in part.parameters()], _RATE)
+    cuda = torch.device(device).type == "cuda"
+    self.optimiser = torch.optim.Adam(
+      [p for part in parts for p in part.parameters()],
+      torch.tensor(_RATE, device=device) if cuda else _RATE, capturable=cuda,
+    )  # fmt: skip
+    self._descend = Recorded(self._learn_from) if cuda else self._learn_from
+    torch.backends.cudnn.benchmark = True  # sizes stay what they are
     self._kept: collections.deque[dict[str, Any]] = collections.deque(maxlen=_KEPT)
     self._random = torch.Generator(device).manual_seed(settings.seed)
     self._alone = torch.arange(self.env.num_envs, device=device) < _ALONE * self.env.num_envs
@@ -151,17 +184,23 @@ class Distillation(Student):
       self._helped = torch.where(again, drawn[1] < helps, self._helped)
       if self._left:
         self._helped &= ~self._alone
-    return {name: torch.stack(values) for name, values in rows.items()} | {"state": first}
+    return {name: torch.stack(values) for name, values in rows.items()} | {"state": first[None]}
 
   def update(self) -> torch.Tensor:
     """Takes a step of the optimiser, by some worlds of an iteration; returns the error."""
-    which, device = int(torch.randint(len(self._kept), ())), self.env.device
-    count = self.env.num_envs
-    worlds = torch.randint(count, (min(WORLDS, count),), generator=self._random, device=device)
-    part = {name: rows[:, worlds] for name, rows in self._kept[which].items() if name != "state"}
+    kept, device = self._kept[int(torch.randint(len(self._kept), ()))], self.env.device
+    size = (min(WORLDS, self.env.num_envs),)
+    worlds = torch.randint(self.env.num_envs, size, generator=self._random, device=device)
+    part = {name: rows[:, worlds] for name, rows in kept.items()}
+    drawn = torch.rand(4, *size, 1, generator=self._random, device=device)
+    part |= {"soft": 0.5 * drawn[0], "light": 1.0 + _LIGHT * (2.0 * drawn[1:] - 1.0)}
+    return self._descend(part).clone()
+
+  def _learn_from(self, part: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """Takes a step of the optimiser by pieces of episodes  (nstep, nworld, ...)."""
     networks, actor = self.networks, self.networks.actor
-    told = actor.sense(part)
-    latent = self._remember(told, part["begun"], self._kept[which]["state"][worlds])
+    told = actor.sense({**part, PICTURES: self._varied(part)})
+    latent = self._remember(told, part["begun"], part["state"][0])
     error = networks.error(latent, part["says"], torch.ones_like(part["begun"]))
     known = networks.critic.obs_normalizer(torch.cat([part[ACTING], part[MORE]], dim=-1))
     more = known[..., part[ACTING].shape[-1] :].clamp(-10.0, 10.0)
@@ -174,6 +213,16 @@ class Distillation(Student):
     torch.nn.utils.clip_grad_norm_([p for p in actor.parameters() if p.grad is not None], 1.0)
     self.optimiser.step()
     return loss.detach()
+
+  def _varied(self, part: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """Returns pictures as other renderers may draw them: edges are softer, the light is another."""
+    seen = part[PICTURES]
+    x = seen.reshape(*seen.shape[:-1], *self.networks.pixels, 3).float()
+    for dim in (-3, -2):
+      around = 0.5 * (x.roll(1, dim) + x.roll(-1, dim))
+      x = torch.lerp(x, around, part["soft"][..., None, None])
+    light = part["light"].movedim(0, -1)[:, :, None]
+    return (x * light).clamp(max=255.0).flatten(2)
 
   def _remember(self, told: torch.Tensor, begun: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
     """Returns the actor's memory in each step, beginning with a state; an episode has its own."""

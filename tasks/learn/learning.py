@@ -148,12 +148,15 @@ class Student:
   @property
   def rate(self) -> float:
     """Learning rate."""
-    return self.optimiser.param_groups[0]["lr"]
+    return float(self.optimiser.param_groups[0]["lr"])
 
   @rate.setter
   def rate(self, value: float) -> None:
     for group in self.optimiser.param_groups:
-      group["lr"] = value
+      if torch.is_tensor(group["lr"]):  # a recorded step reads it
+        group["lr"].fill_(value)
+      else:
+        group["lr"] = value
 
   @property
   def modules(self) -> dict[str, torch.nn.Module]:

@@ -41,6 +41,11 @@ class Encoder(nn.Module):
       layer.weight.data *= _CONTRAST.get(k, 1.0)
       nn.init.zeros_(layer.bias)
     self.head = nn.Linear(3 * CHANNELS[-1], SAID)
+    left = sum(kernel - 1 for kernel in KERNELS[1:])
+    rows, columns = ((n - KERNELS[0]) // STRIDE + 1 - left for n in size)
+    down, across = (torch.linspace(-1.0, 1.0, n) for n in (rows, columns))
+    columns_of = [across.repeat(rows), down.repeat_interleave(columns), torch.ones(rows * columns)]
+    self.register_buffer("places", torch.stack(columns_of, dim=1), persistent=False)
 
   @property
   def layers(self) -> list[Any]:
@@ -54,13 +59,11 @@ class Encoder(nn.Module):
     with torch.autocast(x.device.type, torch.bfloat16, enabled=learns):
       for k, layer in enumerate(self.convolutions):
         x = layer(x.relu() if k else x)
-    height, width = x.shape[2:]
     flat = x.flatten(2).float()
-    share = flat.softmax(dim=2)
-    axes = [torch.linspace(-1.0, 1.0, n, device=x.device) for n in (width, height)]
-    across, down = axes[0].repeat(height), axes[1].repeat_interleave(width)
-    level = flat.logsumexp(dim=2) - torch.log(torch.tensor(float(height * width)))
-    said = self.head(torch.cat([share @ across, share @ down, level], dim=1)).tanh()
+    most = flat.amax(dim=2, keepdim=True).detach()
+    across, down, total = ((flat - most).exp() @ self.places).unbind(dim=2)
+    level = most.squeeze(2) + (total / len(self.places)).log()
+    said = self.head(torch.cat([across / total, down / total, level], dim=1)).tanh()
     return said.reshape(*pixels.shape[:-1], SAID)
 
 
