@@ -25,12 +25,14 @@ from .learning import Settings, Student
 from .networks import ACTING, FINE, MORE, Networks
 from .sight import PICTURES
 
-TEACHER = "teacher"  # group of observations
+TEACHER, PROGRESS = "teacher", "progress"  # groups of observations
 STEPS = 32  # control steps of an iteration
 UPDATES, WORLDS = 32, 64  # steps of the optimiser of an iteration, and worlds of each
 _KEPT = 8  # iterations that are learned from
 _ALONE = 1 / 3  # share of worlds where the student acts alone, once it acts
 _TURN = 40  # control steps of a turn elsewhere, in the mean
+PATIENCE = 120  # control steps without progress that end an episode: who is stuck sees nothing new
+_LITTLE = 1e-3  # that is no progress [-]
 _ACTS, _LEAST = 0.4, 0.2  # share of the training after which the teacher acts least, and how often
 _RATE, _SLOWEST = 1e-3, 0.03  # learning rate, and share of it at the end
 _LIGHT = 0.1  # by how much each colour of a picture varies that is learned from [-]
@@ -120,7 +122,7 @@ class Distillation(Student):
   @property
   def groups(self) -> Mapping[str, Sequence[str]]:
     """See `Student`."""
-    return {**self.networks.groups, TEACHER: self._names}
+    return {**self.networks.groups, TEACHER: self._names, PROGRESS: [PROGRESS]}
 
   @property
   def modules(self) -> dict[str, torch.nn.Module]:
@@ -135,6 +137,8 @@ class Distillation(Student):
   def _begin(self, env: Exercises, seed: int) -> None:
     super()._begin(env, seed)
     self._teacher.reset()
+    self._best = torch.full((self.env.num_envs,), -math.inf, device=self.env.device)
+    self._idle = torch.zeros_like(self._best)
 
   def _learn(self, ended: list[dict[str, torch.Tensor]], stop: Callable[[], bool]) -> float | None:
     part = self._collect(ended, stop)
@@ -173,8 +177,10 @@ class Distillation(Student):
       row = {group: seen[group] for group in (ACTING, PICTURES, MORE)}
       for name, value in {**row, "says": says.clamp(-1.0, 1.0), "begun": begun}.items():
         rows[name].append(value)
+      self._watch(seen[PROGRESS][:, 0])
       _, _, over, extras = self._step(said)
       begun = over.float()
+      self._best.masked_fill_(over.bool(), -math.inf)
       for each in (actor, self._teacher):
         each.reset(over)
       if extras["log"]:
@@ -185,6 +191,12 @@ class Distillation(Student):
       if self._left:
         self._helped &= ~self._alone
     return {name: torch.stack(values) for name, values in rows.items()} | {"state": first[None]}
+
+  def _watch(self, progress: torch.Tensor) -> None:
+    """Ends episodes that do not get on."""
+    self._idle = torch.where(progress > self._best + _LITTLE, 0.0, self._idle + 1.0)
+    self._best = torch.maximum(self._best, progress)
+    self.env.hasten(self._idle > PATIENCE)
 
   def update(self) -> torch.Tensor:
     """Takes a step of the optimiser, by some worlds of an iteration; returns the error."""
