@@ -27,14 +27,14 @@ from .sight import PICTURES
 
 TEACHER, PROGRESS = "teacher", "progress"  # groups of observations
 STEPS = 32  # control steps of an iteration
-UPDATES, WORLDS = 32, 64  # steps of the optimiser of an iteration, and worlds of each
+UPDATES, WORLDS = 64, 32  # steps of the optimiser of an iteration, and worlds of each
 _KEPT = 8  # iterations that are learned from
 _ALONE = 1 / 3  # share of worlds where the student acts alone, once it acts
 _TURN = 40  # control steps of a turn elsewhere, in the mean
 PATIENCE = 120  # control steps without progress that end an episode: who is stuck sees nothing new
 _LITTLE = 1e-3  # that is no progress [-]
 _ACTS, _LEAST = 0.4, 0.2  # share of the training after which the teacher acts least, and how often
-_RATE, _SLOWEST = 1e-3, 0.03  # learning rate, and share of it at the end
+_RATE, _SLOWEST = 3e-3, 0.01  # learning rate, and share of it at the end
 _LIGHT = 0.1  # by how much each colour of a picture varies that is learned from [-]
 _WARM = 3  # times that work is done before it is recorded
 
