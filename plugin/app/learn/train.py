@@ -32,7 +32,7 @@ if TYPE_CHECKING:
   from palpate.tasks.learn.policy import Policy
 
 _FEW = 16  # worlds on a CPU
-_MANY, _SEEING = 4096, 512  # on a GPU, and where pictures are drawn
+_MANY, _SEEING = 4096, 1024  # on a GPU, and where pictures are drawn
 _TRAINED = "trained"  # the teacher that comes with an exercise
 _SAVE = 60.0  # seconds between checkpoints
 ROUNDS = 6  # of lessons, at most
