@@ -221,6 +221,20 @@ class Shaft:
     return math.remainder(-2 * math.atan2(turn[3], turn[0]), 2 * math.pi)
 
 
+class Wrist(Shaft):
+  """How the tip of an instrument with a wrist stands: as it did, turned about its jaws."""
+
+  def __init__(self, trocar: ports.Trocar, quat: Vector):
+    """Takes the instrument's trocar and how the tip stands, w x y z  (4,)."""
+    super().__init__(trocar)
+    w, x, y, z = (float(q) for q in quat)
+    self._start: Quat = (w, x, y, z)
+
+  def quat(self, pos: Vector, roll: float = 0.0) -> Quat:
+    """See `Shaft`; the place makes no difference."""
+    return times(self._start, (math.cos(roll / 2), 0.0, 0.0, -math.sin(roll / 2)))
+
+
 def pose(trocar: ports.Trocar, pos: Vector, roll: float = 0.0) -> np.ndarray:
   """Returns place and orientation, as the shaft has it there, of a handle at `pos` [m]  (7,)."""
   return np.array([*pos, *Shaft(trocar).quat(pos, roll)])

@@ -81,6 +81,11 @@ def attach(
   return frame
 
 
+def kind(prefix: str) -> str:
+  """Returns which instrument has a prefix, such as "psm" has "left_psm/"."""
+  return prefix.rstrip("/").rpartition("_")[2]
+
+
 def aim(pos, target) -> np.ndarray:
   """Returns the quaternion that points the shaft of an instrument at `pos` towards `target`.
 

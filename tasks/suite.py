@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from palpate.models import trocar
 from palpate.tissue.reading import choices
 
 from . import registry
@@ -63,6 +64,12 @@ def ends(name: str) -> dict[str, float]:
   entry = registry.ENTRIES["/".join(split(name))]
   damage = float(entry.make(name=entry.name).damage)
   return {"time": entry.time_limit, "peak_force": damage, "peak_grip": damage}
+
+
+def by_hand(name: str) -> str:
+  """Returns the `input` of an exercise for hands: the tip's pose where instruments have a wrist."""
+  entry = registry.ENTRIES["/".join(split(name))]
+  return "tip" if trocar.kind(entry.make(name=entry.name).prefix) in trocar.WRISTED else "handle"
 
 
 def summary(domain_name: str, task_name: str) -> str:

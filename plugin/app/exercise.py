@@ -263,9 +263,11 @@ def _by_hand(
   journal: pathlib.Path | None,
 ):
   """Returns what runs an episode of a task with a device."""
+  from palpate.tasks import suite
+
   from . import live
 
-  task_kwargs = {"observations": ["joints"], **task_kwargs, "input": "handle"}
+  task_kwargs = {"observations": ["joints"], **task_kwargs, "input": suite.by_hand(name)}
   env = options.load(name, task_kwargs)
   try:
     device, coupled = live.device(args.device), live.Options(scale=args.scale)

@@ -269,17 +269,21 @@ class Batch(abc.ABC):
     """Puts joints of worlds at positions, without velocity.
 
     Args:
-      joints: names of hinges and slides
-      values: positions [rad, m], (nworld, number of joints), here or on the device
+      joints: names of hinges, slides and free joints
+      values: positions [rad, m], one column each, seven of a free joint (place and orientation, w x
+        y z), (nworld, number of columns), here or on the device
       mask: worlds, (nworld,) of bool; None for all
     """
     found = [_named(self.model.joint, "joint", name) for name in joints]
+    adr = []
     for joint in found:
-      if int(joint.type[0]) < int(mujoco.mjtJoint.mjJNT_SLIDE):
-        raise ValueError(f"joint {joint.name!r} is neither a hinge nor a slide")
-    values = self._rows(values, "values", len(found))
+      qpos, dof, kind = int(joint.qposadr[0]), int(joint.dofadr[0]), int(joint.type[0])
+      if kind == mujoco.mjtJoint.mjJNT_BALL:
+        raise ValueError(f"joint {joint.name!r} is a ball, expected a hinge, slide or free joint")
+      count = 7 if kind == mujoco.mjtJoint.mjJNT_FREE else 1  # of six dofs
+      adr += [(qpos + k, dof + min(k, 5)) for k in range(count)]
+    values = self._rows(values, "values", len(adr))
     self._fresh = False
-    adr = [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in found]
     self._pose(np.array(adr, int).reshape(-1, 2), values, self.checked(mask))
 
   def _pose(self, adr: np.ndarray, values: Any, mask: wp.array):

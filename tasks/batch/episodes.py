@@ -66,6 +66,9 @@ class Resting(Posed, Physics):
   def mark(self, *args: Any, **kwargs: Any) -> None:
     """Does nothing: no picture is made."""
 
+  def put(self, *args: Any) -> None:
+    """Does nothing: worlds begin with it."""
+
   def moved(self) -> None:
     """Does nothing: the organ stays where it is."""
 
@@ -160,7 +163,8 @@ class Episodes:
     mj.mj_camlight(model, self.physics.data.ptr)
     frame["eye"] = self.physics.camera()[0]
     frame["reference"] = np.array(self._task.reference_length() or 0.0)
-    return frame | dict(self._draw_own(self._task)) | dict(self._task.tissue())
+    task = self._task
+    return frame | dict(self._draw_own(task)) | dict(task.tissue()) | task.joints | task.bodies
 
 
 def of_physics(physics: Any) -> dict[str, Any]:

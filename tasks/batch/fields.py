@@ -42,6 +42,8 @@ class Common:
   wrist: floats(2)  # see `Trocar`; zeros without one [m]
   move: floats("naxis")  # what an action of 1 adds to the drives' targets [rad, m]
   sensoradr: ints(4)  # of tip and shaft force, force on the left and right jaw
+  needle: int  # first number of the free body `needle` in qpos, -1 without
+  scrape: int  # first number of the sensor `scrape`, -1 without
   around: int  # first number of the sensors of that on what is around, -1 where nothing is
   elem: ints("nelem", 3)
   coarse: ints(COARSE)  # nodes of `surface`
@@ -77,6 +79,7 @@ class Common:
   other_tip_pos: floats("nworld", 3)
   other_tip_quat: floats("nworld", 4)
   other_tissue_force: floats("nworld", 3)
+  other_gripper: floats("nworld", 4)
   # Of an instrument that the exercise itself moves.
   guided_tip_pos: floats("nworld", 3)
   guided_drive: ints(4)

@@ -169,7 +169,8 @@ def measure(s: Common, beginning: bool):
       s.gripper[w, 2 + k] = 0.0
       if not beginning:
         s.gripper[w, 2 + k] = s.sensordata[w, s.sensoradr[2 + k]]
-        grip = wp.max(grip, s.sensor_mean[w, s.sensoradr[2 + k]])
+        if s.drive.shape[0] == 4:  # a needle driver's grip is a needle's
+          grip = wp.max(grip, s.sensor_mean[w, s.sensoradr[2 + k]])
     s.gripper[w, 0] = s.qpos[w, s.opening] + s.qpos[w, s.opening + 1]
     s.gripper[w, 1] = s.ctrl[w, s.jaw]
   s.peak_force[w, 0] = wp.max(felt, grip)

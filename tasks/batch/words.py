@@ -103,6 +103,34 @@ def other_force(s: Common):
 
 
 @word
+def pinch(s: Common):
+  """See `rules`."""
+  return wp.min(s.gripper[s.world, 2], s.gripper[s.world, 3])
+
+
+@word
+def other_pinch(s: Common):
+  """See `rules`."""
+  return wp.min(s.other_gripper[s.world, 2], s.other_gripper[s.world, 3])
+
+
+@word
+def needle_place(s: Common, place: wp.vec3):
+  """See `rules`."""
+  w, k = s.world, s.needle
+  turn = wp.quat(s.qpos[w, k + 4], s.qpos[w, k + 5], s.qpos[w, k + 6], s.qpos[w, k + 3])
+  return wp.vec3(s.qpos[w, k], s.qpos[w, k + 1], s.qpos[w, k + 2]) + wp.quat_rotate(turn, place)
+
+
+@word
+def scraped(s: Common):
+  """See `rules`."""
+  w, k = s.world, s.scrape
+  force = wp.vec3(s.sensordata[w, k], s.sensordata[w, k + 1], s.sensordata[w, k + 2])
+  return wp.length(force)
+
+
+@word
 def lens(s: Common):
   """See `rules`."""
   return tip(s)

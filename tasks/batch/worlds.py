@@ -82,7 +82,7 @@ class Worlds:
       self.other.first = len(task.components) - len(axes(task.second)) - len(task.other)
       for name in ("action", "begun", "step"):
         setattr(self.other, name, getattr(self.fields, name))
-      for name in ("tip_pos", "tip_quat", "tissue_force"):
+      for name in ("tip_pos", "tip_quat", "tissue_force", "gripper"):
         setattr(self.fields, f"other_{name}", getattr(self.other, name))
     if self.episodes.physics.guided:
       self.guided = self._make(task, GUIDED, dt, limit)
@@ -180,6 +180,10 @@ class Worlds:
     s.sensoradr.assign(model.sensor_adr[sensors + [0] * (4 - len(sensors))])
     around = mj.mj_name2id(model, mj.mjtObj.mjOBJ_SENSOR, prefix + AROUND[0])
     s.around = int(model.sensor_adr[around]) if around >= 0 else -1  # the shaft's follows
+    scrape = mj.mj_name2id(model, mj.mjtObj.mjOBJ_SENSOR, "scrape")
+    s.scrape = int(model.sensor_adr[scrape]) if scrape >= 0 else -1
+    needle = mj.mj_name2id(model, mj.mjtObj.mjOBJ_JOINT, "needle")
+    s.needle = int(model.jnt_qposadr[needle]) if needle >= 0 else -1
 
   def _read(self, s: Any) -> None:
     """Brings what is of the batch up to date."""
@@ -347,6 +351,12 @@ class Worlds:
       if self.task.jitter:
         self.batch.place(f"{of}trocar", pos, quat, s.begun)
       self.batch.pose([of + axis for axis in axes(of)], pose, s.begun)
+    for name in self.task.bodies:
+      row = rows[name]
+      self.batch.place(name, row[:, :3], row[:, 3:], s.begun)
+    if self.task.joints:
+      values = np.concatenate([rows[name] for name in self.task.joints], axis=1)
+      self.batch.pose([*self.task.joints], values, s.begun)
     if self._tissue:
       self.organ.configure(mask, **{key: rows[key] for key in self._tissue})
     self.run(self._open)

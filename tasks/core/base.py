@@ -88,6 +88,8 @@ class Task(engine.Task):
     shaping: see the module's head [-]
     best: best progress so far [-]
     cost: of the last control step, see `safety`
+    joints: positions that an episode begins with, by joint, beside the instruments'
+    bodies: places and orientations that it begins with, by body without joints  (7,)
     harm: what costs have taken from the dense reward so far, 0.55 at most [-]
     events: since the last `take_events`
   """
@@ -164,6 +166,8 @@ class Task(engine.Task):
     self.variants = (scene.variant,) if variants is None or model is not None else variants
     self.reward, self.prefix, self.second = reward, *chosen.prefixes
     self.observed = observation.choose(observations, pixels)
+    self.joints: dict[str, np.ndarray] = {}
+    self.bodies: dict[str, np.ndarray] = {}
     self.ranges, self.drawn = randomisation.check(randomise or {}), dict[str, Any]()
     self._models: dict[int | None, Stage] = {}
     if model is not None:
@@ -197,6 +201,10 @@ class Task(engine.Task):
   def other(self) -> tuple[str, ...]:
     """Those of the other hand's instrument."""
     return ("jaw",) if jawed(self.second) else ()
+
+  def still(self, hand: int) -> np.ndarray:
+    """Returns what leaves jaws or head of a hand's instrument as an episode begins."""
+    return np.zeros(len(self.other if hand else self.extra))
 
   def physics(self) -> Physics:
     """Returns the physics of the scene, to make an environment of."""
@@ -342,6 +350,7 @@ class Task(engine.Task):
     physics.quiet()
     self._place_instrument(physics)
     self.begin(physics)
+    physics.put(self.joints, self.bodies)
     self.show(physics)
     self.nodes0 = physics.nodes()
     self.start = physics.tip_pos()

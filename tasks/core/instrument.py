@@ -29,19 +29,14 @@ FOLD, GRIPPING = 0.02, 0.15
 _RATES = np.array(RATES)
 
 
-def kind(prefix: str) -> str:
-  """Returns which instrument has a prefix, such as "psm" has "left_psm/"."""
-  return prefix.rstrip("/").rpartition("_")[2]
-
-
 def axes(prefix: str) -> tuple[str, ...]:
   """Returns the axes of an instrument with a prefix, whose drives an action moves."""
-  return (*AXES, *trocar.WRIST) if kind(prefix) in trocar.WRISTED else AXES
+  return (*AXES, *trocar.WRIST) if trocar.kind(prefix) in trocar.WRISTED else AXES
 
 
 def jawed(prefix: str) -> bool:
   """Returns whether an instrument with a prefix has jaws."""
-  return kind(prefix) in trocar.JAWED
+  return trocar.kind(prefix) in trocar.JAWED
 
 
 class Instrument:

@@ -18,11 +18,12 @@ import mujoco as mj
 import numpy as np
 from dm_env import specs
 from palpate.camera import lens
+from palpate.models import trocar
 
 from . import randomisation
 from .engine import Camera
 from .eyes import OPENGL, see
-from .instrument import jawed, kind
+from .instrument import jawed
 from .physics import COARSE, NEAR, Physics
 from .scenes import CAMERA
 
@@ -462,7 +463,7 @@ def _rows(first: str, second: str) -> list[tuple[str, Row, int]]:
 
 def _has(prefix: str, only: str) -> bool:
   """Returns whether an instrument with a prefix has what a row is of."""
-  return not only or only == kind(prefix) or (only == "jaws" and jawed(prefix))
+  return not only or only == trocar.kind(prefix) or (only == "jaws" and jawed(prefix))
 
 
 @functools.lru_cache

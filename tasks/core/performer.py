@@ -268,7 +268,7 @@ class Performer:
     if not self.trocar.wrist:
       self.tip = trocar.forward(self.trocar, joints[[0, 1, 3]])
     self.roll = float(joints[2])
-    self.extra = np.zeros(len(self.task.other if self._which else self.task.extra))
+    self.extra = self.task.still(self._which)
     late = round(self.style.reaction / self.dt)
     still = self.tip, self.roll, self.turn, self.extra.copy()
     self._told = collections.deque([still] * late, maxlen=late + 1)

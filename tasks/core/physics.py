@@ -4,7 +4,7 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mujoco as mj
@@ -159,6 +159,24 @@ class Physics(Instrument, Portable):
     state = np.empty(mj.mj_stateSize(self.model.ptr, STATE))
     mj.mj_getState(self.model.ptr, self.data.ptr, state, STATE)
     return state
+
+  def free(self, name: str) -> np.ndarray:
+    """Returns place [m] and orientation, w x y z, of the body of a free joint  (7,)."""
+    return self.data.ptr.joint(name).qpos
+
+  def felt_by(self, name: str) -> np.ndarray:
+    """Returns a copy of a sensor of the scene."""
+    return self.data.ptr.sensor(name).data.copy()
+
+  def put(self, joints: Mapping[str, np.ndarray], bodies: Mapping[str, np.ndarray]) -> None:
+    """Puts joints at positions, and bodies that have none at a place and orientation  (7,)."""
+    model, data = self.model.ptr, self.data.ptr
+    for name, row in bodies.items():
+      model.body(name).pos[:], model.body(name).quat[:] = row[:3], row[3:]
+    for name, values in joints.items():
+      data.joint(name).qpos[:] = values
+    if joints or bodies:
+      mj.mj_forward(model, data)
 
   def nodes(self) -> np.ndarray:
     """Returns the positions of the organ's nodes [m]  (nvert, 3); computed once a control step."""

@@ -1,3 +1,5 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
 """The words that the rules of exercises are written in.
 
 A rule is a plain function of the world `s` and of the exercise's state in it, `o`, which it returns
@@ -14,6 +16,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, get_type_hints
 
+import mujoco as mj
 import numpy as np
 import warp as wp
 from palpate.tissue.types import Array
@@ -240,6 +243,28 @@ def other_point(s: Any, place: np.ndarray) -> np.ndarray:
 def other_force(s: Any) -> float:
   """Returns the force of tissue on that instrument below the shaft [N]."""
   return length(s.second.tissue_force())
+
+
+def pinch(s: Any) -> float:
+  """Returns the smaller one of the forces on the two jaws [N]."""
+  return float(s.gripper()[2:].min())
+
+
+def other_pinch(s: Any) -> float:
+  """Returns the same of the other hand's instrument [N]."""
+  return float(s.second.gripper()[2:].min())
+
+
+def needle_place(s: Any, place: np.ndarray) -> np.ndarray:
+  """Returns where a place in the frame of the free body `needle` is [m]."""
+  row, moved = s.free("needle"), np.zeros(3)
+  mj.mju_rotVecQuat(moved, place, row[3:])
+  return row[:3] + moved
+
+
+def scraped(s: Any) -> float:
+  """Returns the force of the sensor `scrape`, of the last step of the physics [N]."""
+  return length(s.felt_by("scrape"))
 
 
 def lens(s: Any) -> np.ndarray:

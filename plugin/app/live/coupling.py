@@ -157,8 +157,9 @@ class Link:
     self.quiet()
 
   def attach(
-    self, shaft: Shaft | None, pos: Sequence[float], quat: Sequence[float], axes: np.ndarray
-  ) -> None:
+    self, shaft: Shaft | None, pos: Sequence[float], quat: Sequence[float], axes: np.ndarray,
+    closed: bool = False,
+  ) -> None:  # fmt: skip
     """Takes the instrument that it moves, where it is: nothing moves by this.
 
     Args:
@@ -166,7 +167,11 @@ class Link:
       pos: of the handle [m]  (3,)
       quat: its orientation  (4,)
       axes: the device's axes in the world, in columns  (3, 3)
+      closed: whether the jaws hold something, and stay closed until the hand has closed too
     """
+    self._closed = closed
+    if closed:
+      self.jaw = -1.0
     self._shaft, self._axes = shaft, [float(x) for x in np.asarray(axes).ravel()]
     if shaft is not None:
       self._roll = shaft.roll(pos, quat)
@@ -261,7 +266,10 @@ class Link:
     asks, self._asked = not self._asked, "pause" in buttons
     self.paused ^= asks and self._asked
     self.grip, self.report = "grip" in buttons, "report" in buttons
-    if jaw is not None:
+    self._closed &= not (self.grip or (jaw is not None and jaw < 0))
+    if self._closed:
+      pass
+    elif jaw is not None:
       self.jaw = self.head = min(max(jaw, -1.0), 1.0)
     elif buttons or self.jaw != 1.0:
       step, target = _CLOSE / self.device.rate, _OPEN if "grip" in buttons else 1.0

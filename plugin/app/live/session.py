@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from palpate.models import laparoscope
-from palpate.models.handle import Shaft
+from palpate.models.handle import Shaft, Wrist
 from palpate.tasks.core import episode
 from palpate.tasks.core.handle import ROW
 from palpate.tasks.recording import Recording
@@ -39,7 +39,7 @@ class Session:
   and stop it, and read `link.state` and `link.message`.
 
   Attributes:
-    env: of the suite, with `input="handle"`
+    env: of the suite, with an `input` of `suite.by_hand`
     pace: of the loop
     links: between devices and instruments, the main one first
     scope: laparoscope that a hand holds or that follows, None where the camera is an instrument's
@@ -63,7 +63,7 @@ class Session:
     """Prepares the exercise.
 
     Args:
-      env: of the suite, with `input="handle"`
+      env: of the suite, with an `input` of `suite.by_hand`
       device: of the hand, where there are two of the one that has the main instrument
       seed: of the episode
       info: further entries of the recording; with `task_kwargs` it can be replayed
@@ -76,8 +76,8 @@ class Session:
       camera: device that holds the laparoscope, None where it stands
       journal: file that takes the exercise second by second, see `Recorder`
     """
-    if not env.task.scene.handle:
-      raise ValueError(f"{env.task.name}: input is 'drives', expected 'handle' for a device")
+    if env.task.scene.input == "drives":
+      raise ValueError(f"{env.task.name}: input is 'drives', expected 'handle' or 'tip'")
     if bool(env.task.second) != (other is not None):
       hands = "two hands, expected another" if env.task.second else "one hand, expected no other"
       raise ValueError(f"{env.task.name}: it takes {hands} device")
@@ -141,9 +141,13 @@ class Session:
       self._rows[:] = 0.0
       self._held.clear()
       first, extras = 0, (task.extra, task.other)
-      for hand, link, extra in zip(physics.hands, self.links, extras, strict=False):
-        handle = hand.handle
-        link.attach(Shaft(hand.trocar()), handle.pos, handle.quat, turn)
+      for k, (hand, link, extra) in enumerate(
+        zip(physics.hands, self.links, extras, strict=False)
+      ):
+        handle, port = hand.handle, hand.trocar()
+        shaft = Wrist(port, handle.quat) if port.wrist else Shaft(port)
+        closed = port.wrist and "jaw" in extra and float(task.still(k)[0]) < 0
+        link.attach(shaft, handle.pos, handle.quat, turn, closed=bool(closed))
         self._rows[:, first : first + len(ROW)] = link.row
         first += len(ROW)
         said = [(first + i, _SAYS[name]) for i, name in enumerate(extra) if name in _FIRST]

@@ -405,7 +405,9 @@ class Worker:
 def _kwargs(job: dict[str, Any]) -> dict[str, Any]:
   """Returns the options of an exercise's environment."""
   nodes = {"nodes": job["nodes"]} if job["nodes"] else {}
-  return {"input": "handle", "observations": ["joints"], **nodes}
+  from palpate.tasks import suite
+
+  return {"input": suite.by_hand(job["task"]), "observations": ["joints"], **nodes}
 
 
 def _status(now: Session | Practice) -> dict[str, Any]:
