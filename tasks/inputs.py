@@ -36,6 +36,9 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "depth": (),
   "current": (),
   "idle_current": (),
+  "regrasped": (),
+  "ring_time": (),
+  "ring_force": (),
 }
 # Those that are measured faster: with substeps, magnitudes, one for each since the last sample.
 SIGNALS = ("force", "grip_force", "shaft_force", "surroundings_force")

@@ -217,7 +217,9 @@ class Recorder:
         on what it is bonded to [N]; of a cut so far, `deviation`, mean distance from its line [m],
         `farthest`, the largest [m], `excess`, area between the two [m^2], `jagged`, length that is
         more than 2 mm off [m], `depth`, of the blade under the wall at most [m]; `current`, time
-        that one was on so far [s], and `idle_current` without touching what it is to free [s]
+        that one was on so far [s], and `idle_current` without touching what it is to free [s];
+        `regrasped`, how often the needle was taken so far, `ring_time`, how long rings were touched
+        [s], and `ring_force`, with how much at most [N]
     """
     time = float(time)
     if not (math.isfinite(time) and time > self._last):

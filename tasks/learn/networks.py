@@ -176,9 +176,10 @@ class Networks:
     for name in names:
       units = ROWS[name].unit.split(", ") if name in ROWS else []
       least = [_VARY[unit] for unit in units] or [0.0]
-      if len(least) == 2:  # three angles and the insertion
-        least = 3 * least[:1] + least[1:]
-      out += least * (math.prod(self._shapes[name]) // len(least))
+      size = math.prod(self._shapes[name])
+      if len(least) == 2:  # three angles, the insertion, and the angles of a wrist
+        least = 3 * least[:1] + least[1:] + (size - 4) * least[:1]
+      out += least * (size // len(least))
     return torch.tensor(out)
 
   def action(self, said: torch.Tensor, last: torch.Tensor) -> torch.Tensor:

@@ -156,6 +156,36 @@ def current_wasted(idle_current: ArrayLike) -> float:
   return float(rows("idle_current", idle_current)[-1])
 
 
+@metric("Grasps of the needle", "count", "efficiency", "all", "GEARS: 10.1016/j.juro.2011.09.032")
+def regrasps(regrasped: ArrayLike) -> float:
+  """Returns how often a hand took the needle [count], lower is better.
+
+  Args:
+    regrasped: times so far  (nstep,)
+  """
+  return float(rows("regrasped", regrasped)[-1])
+
+
+@metric("Contact with rings", "s", "safety", "all", "this project; as `shaft_contact`")
+def ring_contact(ring_time: ArrayLike) -> float:
+  """Returns how long needle or instruments touched the rings [s], lower is better.
+
+  Args:
+    ring_time: time so far [s]  (nstep,)
+  """
+  return float(rows("ring_time", ring_time)[-1])
+
+
+@metric("Peak force on rings", "N", "safety", "all", "this project; as `peak_force`")
+def peak_ring_force(ring_force: ArrayLike) -> float:
+  """Returns the largest force on the rings [N], lower is better.
+
+  Args:
+    ring_force: largest so far [N]  (nstep,)
+  """
+  return float(rows("ring_force", ring_force)[-1])
+
+
 @metric("Tracing error (Frechet)", "m", "outcome", "all", "Perk Tutor; Eiter and Mannila 1994")
 def trace_frechet(traced_pos: ArrayLike, curve: ArrayLike) -> float:
   """Returns the discrete Frechet distance of the tip's path to a curve [m], lower is better.

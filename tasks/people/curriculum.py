@@ -31,6 +31,9 @@ AFTER |= {
   "probe/palpate_easy": "probe/standard",
   "probe/palpate_standard": "probe/palpate_easy",
   **{f"{domain}/hard": f"{domain}/standard" for domain in _DOMAINS},
+  "needle/transfer_easy": "grasp/easy",
+  "needle/transfer_standard": "needle/transfer_easy",
+  "needle/transfer_hard": "needle/transfer_standard",
   "probe/palpate_hard": "probe/palpate_standard",
 }
 RULE = f"{CONSECUTIVE} proficient attempts in a row and {REPEATS} more"

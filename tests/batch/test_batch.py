@@ -431,6 +431,9 @@ def test_sensors_are_summed_up_over_the_steps_of_a_call():
 def test_reset_goes_to_the_state_it_was_given_and_joints_and_bodies_to_theirs():
   made = spec(probed())
   made.worldbody.add_body(name="mark", pos=[0, 0, 0])
+  loose = made.worldbody.add_body(name="loose", pos=[1, 0, 0])
+  loose.add_freejoint(name="loose")
+  loose.add_geom(size=[0.01, 0, 0], contype=0, conaffinity=0)
   batch = palpate.batch.make(made, 3)
   model, data = batch.model, mujoco.MjData(batch.model)
   drive(model, data, 60)
@@ -447,6 +450,13 @@ def test_reset_goes_to_the_state_it_was_given_and_joints_and_bodies_to_theirs():
   assert np.array_equal(batch.qpos.numpy()[1], before[1])
   with pytest.raises(ValueError, match=r"values has shape \(2,\), expected \(3, 2\)"):
     batch.pose("zx", [0, 0])
+  place = np.array([0.5, 0.4, 0.3, 0.8, 0.6, 0.0, 0.0, 0.002])  # of the free body, then of x
+  batch.pose(["loose", "x"], np.tile(place, (3, 1)), mask)
+  start = int(model.joint("loose").qposadr[0])
+  now = batch.qpos.numpy()
+  assert now[0, start : start + 7] == pytest.approx(place[:7])
+  assert now[0, adr[1]] == pytest.approx(0.002)
+  assert np.array_equal(now[1], before[1])
   batch.place("mark", np.tile([1.0, 2, 3], (3, 1)), np.tile([1.0, 0, 0, 0], (3, 1)), mask)
   assert not batch.model.body("mark").pos.any()
   with pytest.raises(ValueError, match="body 'tool' has joints"):

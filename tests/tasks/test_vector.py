@@ -66,7 +66,7 @@ def distances(name, values):
 def compare(seen, expected):
   for name, values in expected.items():
     a, b = (distances(name, np.asarray(v)) for v in (seen[name], values))
-    limit = LIMITS.get(name.removeprefix("hook_"), 2e-4)
+    limit = LIMITS.get(name.removeprefix("hook_").removeprefix("left_psm_"), 2e-4)
     np.testing.assert_allclose(a, b, atol=limit, err_msg=name)
 
 
@@ -94,6 +94,7 @@ def compare_metrics(told, k, expected):
     ("bimanual/easy", 1, 230, {"wanted": 0.03}),
     ("cut/easy", 1, 266, {"radius": 0.006}),
     ("navigate/hard", 1, 153, {"variants": (None,), "marks": 1, "hold": 0.1, "follow": 0.3}),
+    ("needle/transfer_easy", 1, 90, {}),
   ],
 )
 def test_each_world_is_the_single_environment_of_its_seed(task, count, steps, options):

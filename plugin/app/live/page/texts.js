@@ -29,7 +29,8 @@ const GERMAN = {
   "next": "als Nächstes", "done": "geschafft", "proficient": "sicher", "open": "offen", "after {0}": "nach {0}", "{0} of {1} attempts proficient": "{0} von {1} Versuchen sicher",
   "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate_easy": "Tasten, leicht", "palpate_standard": "Tasten, mittel", "palpate_hard": "Tasten, schwer",
   "touch": "Berühren", "probe": "Drücken und Tasten", "trace": "Nachfahren", "grasp": "Greifen", "retract": "Weghalten", "tease": "Ablösen",
-  "dissect": "Abpräparieren", "cut": "Schneiden", "bimanual": "Mit zwei Händen", "navigate": "Kamera führen",
+  "dissect": "Abpräparieren", "cut": "Schneiden", "bimanual": "Mit zwei Händen", "navigate": "Kamera führen", "needle": "Nadel übergeben",
+  "transfer_easy": "Übergeben, leicht", "transfer_standard": "Übergeben, mittel", "transfer_hard": "Übergeben, schwer",
   // What runs.
   "Loading {0}": "Lädt {0}", "Loading {0}, which takes a minute or more": "Lädt {0}, das dauert eine Minute oder mehr",
   "Choose an exercise and press Start.": "Wähle eine Übung und drücke Start.",
@@ -84,6 +85,12 @@ const GERMAN = {
   "Bring the yellow mark into the middle, # of #": "Bring die gelbe Marke in die Mitte, # von #", "Bring the instrument into the middle, # of #": "Bring das Instrument in die Mitte, # von #",
   "Go nearer": "Geh näher heran", "Go back": "Geh zurück", "Roll the scope until you look along the pin": "Drehe die Optik, bis du den Stift entlang siehst",
   "Turn the camera until the picture is level": "Drehe die Kamera, bis das Bild gerade steht",
+  "Take the needle": "Nimm die Nadel", "Bring the needle's tip through ring # of #": "Führe die Spitze der Nadel durch Ring # von #",
+  "Bring the needle's blunt end through ring # of #": "Führe das stumpfe Ende der Nadel durch Ring # von #", "Pull it through": "Zieh sie hindurch",
+  "Take the needle with the left hand": "Nimm die Nadel mit der linken Hand", "Take the needle with the right hand": "Nimm die Nadel mit der rechten Hand",
+  "Let go with the left hand": "Lass mit der linken Hand los", "Let go with the right hand": "Lass mit der rechten Hand los",
+  "Grasps of the needle": "Griffe an die Nadel", "Contact with rings": "Kontakt mit Ringen", "Peak force on rings": "Größte Kraft auf Ringe",
+  "plan how the other hand is to take it before you hand it over": "plane vor dem Übergeben, wie die andere Hand sie nimmt", "turn the needle about its circle in place of pushing it": "drehe die Nadel um ihren Kreis, statt sie zu schieben",
   "Too much force: # N, expected at most # N": "Zu viel Kraft: # N, höchstens # N", "The shaft presses on the organ with # N": "Der Schaft drückt mit # N auf das Organ",
   "You press on what is around with # N": "Du drückst mit # N auf die Umgebung", "The tip is out of the picture": "Die Spitze ist nicht im Bild",
   "Peak force": "Größte Kraft", "Mean force in contact": "Mittlere Kraft im Kontakt", "Force-time product": "Kraft mal Zeit", "Force limit breaches": "Überschreitungen der Kraft",
@@ -106,8 +113,9 @@ const GERMAN = {
 };
 const ENGLISH = {
   "touch": "Touch", "probe": "Press and palpate", "trace": "Follow a line", "grasp": "Grasp and lift", "retract": "Hold aside", "tease": "Tease off",
-  "dissect": "Dissect", "cut": "Cut", "bimanual": "With two hands", "navigate": "Hold the camera", "easy": "Easy", "standard": "Standard", "hard": "Hard", "depth": "Depth",
+  "dissect": "Dissect", "cut": "Cut", "bimanual": "With two hands", "navigate": "Hold the camera", "needle": "Hand a needle over", "easy": "Easy", "standard": "Standard", "hard": "Hard", "depth": "Depth",
   "palpate_easy": "Palpate, easy", "palpate_standard": "Palpate, standard", "palpate_hard": "Palpate, hard",
+  "transfer_easy": "Transfer, easy", "transfer_standard": "Transfer, standard", "transfer_hard": "Transfer, hard",
 };
 export const LANGUAGES = {en: ENGLISH, de: GERMAN};
 
