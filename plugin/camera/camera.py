@@ -12,28 +12,21 @@ import numpy as np
 import warp as wp
 from palpate.engine.model import flexes
 from palpate.tissue.device import refuse_crowd, room_of
-from palpate.tissue.types import blank, fill
+from palpate.tissue.types import DIMS, allocate, blank, fill
 
-from . import kernels
+from . import filling, shading
 from .host import Host
 from .lens import Lens, lens, see
 from .scene import Scene, colour, labelled, site_size, texture
 from .soft import Surface
+from .view import LARGEST, NOTHING, Pictures, View
 
 if TYPE_CHECKING:
   from palpate.engine.model.declare import Declaration
 
 _OBJ, _LIGHT = mujoco.mjtObj, mujoco.mjtLightType
-OUTPUTS = {  # dtype of Warp, and what follows height and width
-  "pixels": (wp.uint8, (3,)),
-  "depth": (wp.float32, ()),
-  "segmentation": (wp.vec2i, ()),
-  "labels": (wp.uint8, ()),
-  "points": (wp.vec3, ()),
-  "flow": (wp.vec2, ()),
-  "soiling": (wp.uint8, (2,)),
-}
-_MOVED = ("eye", "look", "to_eye", "from_eye", "point")  # what a flow is found from
+OUTPUTS = tuple(Pictures.vars)
+_MOVED = ("eye", "look", "to_eye", "from_eye")  # what a flow is found from, beside points
 _OF_ROWS = ("lamp_pos", "lamp_dir", "ambient", "diffuse", "specular")
 MOST = 1024  # height and width [pixels]
 _VERTEX, _TRIANGLE = 36.0, 13.0  # bytes that a row has for those of organs
@@ -50,7 +43,7 @@ class Camera:
   Attributes:
     pictures: arrays of the last `draw` by name, a row a world; they keep their place
     worlds: numbers of the worlds
-    view: what the kernels read, a row a world, see `kernels.View`
+    view: what the kernels read, a row a world, see `View`
     lens: what pictures are seen through, see `lens`; None for nothing
   """
 
@@ -103,24 +96,27 @@ class Camera:
     ]
     self._surfaces = [each for each in self._surfaces if each.nvert]
     self._refuse_crowd(size, outputs, 2 if through else 1)
-    values = self._allocate(size, outputs)
+    values = self._allocate(size)
+    values["out"] = self._pictures(size, outputs)
     values["shift"] = np.zeros(len(self.worlds)) if shift is None else np.array(shift, float)
     values |= self._things(labels) | self._parts() | self._organs(values)
     values |= self._view(model, camera)
-    values |= {f"{n}_before": blank(kernels.View, f"{n}_before", self._device) for n in _MOVED}
-    self.view: Any = fill(kernels.View, self._device, values)
+    values |= {f"{n}_before": blank(View, f"{n}_before", self._device) for n in _MOVED}
+    self.view: Any = fill(View, self._device, values)
     for name in _MOVED if "flow" in outputs else ():
       setattr(self.view, f"{name}_before", wp.zeros_like(getattr(self.view, name)))
-    self.pictures = {name: values[name] for name in outputs}
-    self.lens = self._through(outputs, values) if through else None
+    self.lens = self._through(size, outputs) if through else None
+    shown = self.view.out if self.lens is None else self.lens.seen
+    self.pictures: dict[str, Any] = {name: getattr(shown, name) for name in outputs}
 
   # Making.
 
   def _refuse_crowd(self, size: tuple[int, int], outputs: Sequence[str], times: int):
     """Raises ValueError where there is no room for so many pictures, each kept so many times."""
     pixel = times * sum(
-      wp.types.type_size_in_bytes(dtype) * int(np.prod(more))
-      for dtype, more in (OUTPUTS[name] for name in outputs)
+      wp.types.type_size_in_bytes(Pictures.vars[name].type.dtype)
+      * int(np.prod(DIMS[Pictures.key][name][3:]))
+      for name in outputs
     )
     each = size[0] * size[1] * pixel + 160.0 * (len(self.scene.things) + len(self.scene.parts))
     each += sum(_VERTEX * s.nvert + _TRIANGLE * len(s.face) for s in self._surfaces)
@@ -128,7 +124,12 @@ class Camera:
       len(self.worlds), each, room_of(self._device), str(self._device), "worlds to draw are"
     )
 
-  def _allocate(self, size: tuple[int, int], outputs: Sequence[str]) -> dict[str, Any]:
+  def _pictures(self, size: tuple[int, int], outputs: Sequence[str]) -> Any:
+    sizes = {"nrow": len(self.worlds), "height": size[0], "width": size[1]}
+    spare = tuple(name for name in OUTPUTS if name not in outputs)
+    return allocate(Pictures, self._device, sizes, spare)
+
+  def _allocate(self, size: tuple[int, int]) -> dict[str, Any]:
     n = len(self.worlds)
     values: dict[str, Any] = {"height": size[0], "width": size[1]}
     values["world"] = wp.array(self.worlds, dtype=int, device=self._device)
@@ -136,14 +137,11 @@ class Camera:
     some = min(n, -(-_SOME // (size[0] * size[1])))
     through = some * any(part.clear for part in self.scene.parts)
     for name, rows in (("solid", some), ("clear", through)):
-      values[name] = wp.full((rows, *size), kernels.NOTHING, dtype=wp.uint64, device=self._device)
-    large = (some, kernels.LARGEST)
+      values[name] = wp.full((rows, *size), NOTHING, dtype=wp.uint64, device=self._device)
+    large = (some, LARGEST)
     little = _LITTLE if self._device.is_cuda else MOST * MOST
     values |= {"little": little, "nlarge": np.zeros(n, np.int32)}
     values |= {"large": np.zeros(large, np.int32), "large_at": np.zeros((*large, 3, 3))}
-    for name, (dtype, more) in OUTPUTS.items():
-      shape = (n * (name in outputs), *size, *more)
-      values[name] = wp.zeros(shape, dtype=dtype, device=self._device)
     return values
 
   def _rows(self, values: Any) -> np.ndarray:
@@ -158,7 +156,7 @@ class Camera:
       m: the batch's model, or another of the same scene; its colours, lamps and camera may differ
 
     Returns:
-      values of fields of `kernels.View`, without their first axis
+      values of fields of `View`, without their first axis
     """
     mat, lamps, things = np.zeros(9), _lamps(m), self.scene.things
     mujoco.mju_quat2Mat(mat, m.cam_quat[self._number])
@@ -186,19 +184,17 @@ class Camera:
       values: as `look` returns them, or of a `Lens`, a row for each of these
     """
     for name, value in values.items():
-      array = getattr(self.view if name in kernels.View.vars else self.lens, name)
+      array = getattr(self.view if name in View.vars else self.lens, name)
       whole = np.array(value, np.float32) if len(rows) == len(self.worlds) else array.numpy()
       whole[rows] = value
       array.assign(whole)
 
-  def _through(self, outputs: Sequence[str], sent: Mapping[str, Any]) -> Any:
-    """Returns what pictures are seen through, and shows these in place of those that are sent."""
+  def _through(self, size: tuple[int, int], outputs: Sequence[str]) -> Any:
+    """Returns what pictures are seen through."""
     shared = ("chosen", "fovy", "seed", "far")
     values: dict[str, Any] = {name: getattr(self.view, name) for name in shared}
-    values |= {f"sent_{name}": sent[name] for name in OUTPUTS}
-    values |= {name: wp.zeros_like(sent[name]) for name in OUTPUTS}
+    values |= {"sent": self.view.out, "seen": self._pictures(size, outputs)}
     values |= {name: self._rows(value) for name, value in lens({}).items()}
-    self.pictures = {name: values[name] for name in outputs}
     return fill(Lens, self._device, values)
 
   def _things(self, labels: Mapping[tuple[int, int], int] | None) -> dict[str, Any]:
@@ -250,7 +246,7 @@ class Camera:
       return dict(
         stride=0, soft_corner=np.zeros((n, 0, 3), np.int32),
         point=np.zeros((0, 3)), normal=np.zeros((0, 3)), lips=np.zeros((n, 0), np.uint8),
-        lip_thing=np.zeros(0, np.int32),
+        lip_thing=np.zeros(0, np.int32), point_before=np.zeros((0, 3)),
       )  # fmt: skip
     face = np.concatenate([s.face + k for s, k in zip(self._surfaces, nvert, strict=False)])
     corner = (face[None] + stride * np.arange(n)[:, None, None]).astype(np.int32)
@@ -260,6 +256,8 @@ class Camera:
       normal = wp.zeros(len(point), dtype=wp.vec3)
       index = wp.array(corner.reshape(-1), dtype=int)
       shared = {"point": point, "normal": normal, "corner": index.reshape((n, count, 3))}
+      flows = values["out"].flow.shape[0] > 0
+      shared["before"] = wp.zeros_like(point) if flows else wp.zeros(0, dtype=wp.vec3)
       self._soft = [
         s.make(values["world"], int(a), int(b), shared)
         for s, a, b in zip(self._surfaces, nvert, nface, strict=False)
@@ -267,7 +265,7 @@ class Camera:
     return dict(
       stride=stride, soft_corner=shared["corner"], point=point,
       normal=normal, lips=np.zeros((n, count), np.uint8),
-      lip_thing=np.concatenate([s.lip for s in self._surfaces]),
+      lip_thing=np.concatenate([s.lip for s in self._surfaces]), point_before=shared["before"],
     )  # fmt: skip
 
   def _view(self, m: mujoco.MjModel, camera: int) -> dict[str, Any]:
@@ -334,10 +332,12 @@ class Camera:
         wp.copy(getattr(c, f"{name}_before"), getattr(c, name))
       for surface, soft in zip(self._surfaces, self._soft, strict=True):
         soft.x = surface.tissue.xpos
-        wp.launch(kernels.follow, dim=(n, surface.nvert), inputs=[soft])
-        wp.launch(kernels.lift, dim=(n, surface.nvert), inputs=[soft])
-      wp.launch(kernels.aim, dim=n, inputs=[c])
-      wp.launch(kernels.put, dim=(n, c.part_body.shape[0]), inputs=[c])
+        if soft.before.shape[0] > 0:
+          wp.launch(filling.remember, dim=(n, surface.nvert), inputs=[soft])
+        wp.launch(filling.follow, dim=(n, surface.nvert), inputs=[soft])
+        wp.launch(filling.lift, dim=(n, surface.nvert), inputs=[soft])
+      wp.launch(filling.aim, dim=n, inputs=[c])
+      wp.launch(filling.put, dim=(n, c.part_body.shape[0]), inputs=[c])
 
   def launch(self):
     """Launches what draws; it can be recorded in a graph."""
@@ -347,8 +347,8 @@ class Camera:
       tiles = -(-c.width // 8) * -(-c.height // 4)
       for start in range(0, n, c.solid.shape[0]):
         some = min(c.solid.shape[0], n - start)
-        wp.launch(kernels.fill, dim=(some, c.thing.shape[0]), inputs=[c, start])
-        wp.launch(kernels.draw, dim=(some, tiles, _TILE), inputs=[c, start], block_dim=_BLOCK)
+        wp.launch(filling.fill, dim=(some, c.thing.shape[0]), inputs=[c, start])
+        wp.launch(shading.draw, dim=(some, tiles, _TILE), inputs=[c, start], block_dim=_BLOCK)
       if self.lens is not None:
         wp.launch(see, dim=(n, c.height, c.width), inputs=[self.lens, c.height, c.width])
 

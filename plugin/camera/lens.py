@@ -12,9 +12,10 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array, floats, ints, struct
 
+from .view import Pictures
+
 SMOKE = 0.75  # its grey
 DROPS = 16  # of blood, at most
-PICTURES = ("pixels", "depth", "segmentation", "labels", "points", "flow", "soiling")  # of a `Lens`
 _SMOKE, _DROPS = wp.constant(SMOKE), wp.constant(DROPS)
 _BLOOD = wp.constant(wp.vec3(0.30, 0.02, 0.02))
 _THICK = wp.constant(0.92)  # share of a drop's colour in its middle
@@ -24,7 +25,7 @@ _OUTSIDE = wp.constant(-1e6)
 
 @struct
 class Lens:
-  """Pictures of rows as a scene sends them, and as they are seen; what is not wanted is empty."""
+  """Pictures of rows as a scene sends them, and as they are seen."""
 
   chosen: Array(wp.bool, ("nrow",))  # whether a picture is seen
   fovy: floats("nrow")  # [rad]
@@ -34,20 +35,8 @@ class Lens:
   drop: Array(wp.vec3, ("nrow", DROPS))  # middle, right and down of the picture's; radius [heights]
   seed: ints("nrow")  # of the noise
   far: float  # depth where nothing is [m]
-  sent_pixels: Array(wp.uint8, ("nrow", "height", "width", 3))
-  sent_depth: floats("nrow", "height", "width")
-  sent_segmentation: Array(wp.vec2i, ("nrow", "height", "width"))
-  sent_labels: Array(wp.uint8, ("nrow", "height", "width"))
-  sent_points: Array(wp.vec3, ("nrow", "height", "width"))
-  sent_flow: Array(wp.vec2, ("nrow", "height", "width"))
-  sent_soiling: Array(wp.uint8, ("nrow", "height", "width", 2))  # nothing sends it
-  pixels: Array(wp.uint8, ("nrow", "height", "width", 3))
-  depth: floats("nrow", "height", "width")
-  segmentation: Array(wp.vec2i, ("nrow", "height", "width"))
-  labels: Array(wp.uint8, ("nrow", "height", "width"))
-  points: Array(wp.vec3, ("nrow", "height", "width"))
-  flow: Array(wp.vec2, ("nrow", "height", "width"))
-  soiling: Array(wp.uint8, ("nrow", "height", "width", 2))
+  sent: Pictures  # by the scene
+  seen: Pictures
 
 
 def lens(drawn: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -101,9 +90,9 @@ def straight(k: wp.vec2, at: wp.vec2):
 @wp.func
 def byte_at(s: Lens, r: int, i: int, j: int):
   """Returns the colour of a pixel, or of the nearest one at the rim."""
-  a = wp.clamp(i, 0, s.sent_pixels.shape[1] - 1)
-  b = wp.clamp(j, 0, s.sent_pixels.shape[2] - 1)
-  red, green, blue = s.sent_pixels[r, a, b, 0], s.sent_pixels[r, a, b, 1], s.sent_pixels[r, a, b, 2]
+  a = wp.clamp(i, 0, s.sent.pixels.shape[1] - 1)
+  b = wp.clamp(j, 0, s.sent.pixels.shape[2] - 1)
+  red, green, blue = s.sent.pixels[r, a, b, 0], s.sent.pixels[r, a, b, 1], s.sent.pixels[r, a, b, 2]
   return wp.vec3(float(red), float(green), float(blue)) / 255.0
 
 
@@ -136,32 +125,32 @@ def see(s: Lens, height: int, width: int):
     x, y = from_[0], from_[1]
   ni, nj = int(wp.floor(y + 0.5)), int(wp.floor(x + 0.5))
   inside = ni >= 0 and nj >= 0 and ni < height and nj < width
-  if s.depth.shape[0] > 0:
-    s.depth[r, i, j] = s.far
+  if s.seen.depth.shape[0] > 0:
+    s.seen.depth[r, i, j] = s.far
     if inside:
-      s.depth[r, i, j] = s.sent_depth[r, ni, nj]
-  if s.points.shape[0] > 0:
-    s.points[r, i, j] = wp.vec3()
+      s.seen.depth[r, i, j] = s.sent.depth[r, ni, nj]
+  if s.seen.points.shape[0] > 0:
+    s.seen.points[r, i, j] = wp.vec3()
     if inside:
-      s.points[r, i, j] = s.sent_points[r, ni, nj]
-  if s.segmentation.shape[0] > 0:
-    s.segmentation[r, i, j] = wp.vec2i(-1, -1)
+      s.seen.points[r, i, j] = s.sent.points[r, ni, nj]
+  if s.seen.segmentation.shape[0] > 0:
+    s.seen.segmentation[r, i, j] = wp.vec2i(-1, -1)
     if inside:
-      s.segmentation[r, i, j] = s.sent_segmentation[r, ni, nj]
-  if s.labels.shape[0] > 0:
-    s.labels[r, i, j] = wp.uint8(0)
+      s.seen.segmentation[r, i, j] = s.sent.segmentation[r, ni, nj]
+  if s.seen.labels.shape[0] > 0:
+    s.seen.labels[r, i, j] = wp.uint8(0)
     if inside:
-      s.labels[r, i, j] = s.sent_labels[r, ni, nj]
-  if s.flow.shape[0] > 0:
-    s.flow[r, i, j] = wp.vec2()
+      s.seen.labels[r, i, j] = s.sent.labels[r, ni, nj]
+  if s.seen.flow.shape[0] > 0:
+    s.seen.flow[r, i, j] = wp.vec2()
     if inside:  # where the lens would have shown it before
-      was = (wp.vec2(x, y) - s.sent_flow[r, ni, nj] - middle) * pixel
-      s.flow[r, i, j] = wp.vec2(float(j), float(i)) - (bent(s.bend[r], was) / pixel + middle)
+      was = (wp.vec2(x, y) - s.sent.flow[r, ni, nj] - middle) * pixel
+      s.seen.flow[r, i, j] = wp.vec2(float(j), float(i)) - (bent(s.bend[r], was) / pixel + middle)
   film, before = s.film[r], blood(s, r, (wp.vec2(float(j), float(i)) - middle) / h)
-  if s.soiling.shape[0] > 0:
-    s.soiling[r, i, j, 0] = wp.uint8(255.0 * film[0] + 0.5)
-    s.soiling[r, i, j, 1] = wp.uint8(255.0 * before + 0.5)
-  if s.pixels.shape[0] == 0:
+  if s.seen.soiling.shape[0] > 0:
+    s.seen.soiling[r, i, j, 0] = wp.uint8(255.0 * film[0] + 0.5)
+    s.seen.soiling[r, i, j, 1] = wp.uint8(255.0 * before + 0.5)
+  if s.seen.pixels.shape[0] == 0:
     return
   shake, taps, out = s.shake[r] * h, wp.int32(1), wp.vec3()
   if wp.length_sq(shake) > 0.0:
@@ -182,4 +171,4 @@ def see(s: Lens, height: int, width: int):
     grain = wp.rand_init(s.seed[r], (r * height + i) * width + j)
     out += film[2] * wp.vec3(wp.randn(grain), wp.randn(grain), wp.randn(grain))
   for l in range(3):
-    s.pixels[r, i, j, l] = wp.uint8(wp.clamp(255.0 * out[l] + 0.5, 0.0, 255.0))
+    s.seen.pixels[r, i, j, l] = wp.uint8(wp.clamp(255.0 * out[l] + 0.5, 0.0, 255.0))

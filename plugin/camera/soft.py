@@ -24,9 +24,9 @@ from palpate.tissue.types import fill
 from scipy.sparse import csr_array, eye_array, hstack
 
 from .host import Seen
-from .kernels import Soft
 from .scene import SEEN, Scene, repeat, skin
 from .shapes import Triangles, smooth
+from .view import Soft
 
 _OBJ = mujoco.mjtObj
 _FAINT = 1e-3  # weights of vertices that a smooth surface does without

@@ -18,7 +18,7 @@ class Marks:
   """Marks of the pictures of rows, a row a world that is drawn."""
 
   world: ints("nrow")
-  part: ints("nmark")  # of a camera, see `palpate.camera.kernels.View`
+  part: ints("nmark")  # of a camera, see `palpate.camera.view.View`
   thing: ints("nmark")
   pos: Array(wp.vec3, ("nrow", "npart"))
   rgba: Array(wp.vec4, ("nrow", "nthing"))

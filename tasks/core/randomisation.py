@@ -18,7 +18,8 @@ import numpy as np
 import warp as wp
 from palpate.camera import lens
 from palpate.camera.lens import DROPS
-from palpate.tissue.types import blank, fill
+from palpate.camera.view import Pictures
+from palpate.tissue.types import allocate, fill
 
 from . import stage
 from .physics import Physics
@@ -220,7 +221,7 @@ def see(
   """Returns pictures as lens and sensor make them, of what the scene sends there.
 
   Args:
-    pictures: some of those of a `lens.Lens`, of one camera
+    pictures: some of `Pictures`, of one camera
     drawn: what `apply` returned
     fovy: field of view [rad]
     far: depth where nothing is [m]
@@ -229,13 +230,14 @@ def see(
   height, width = next(iter(pictures.values())).shape[:2]
   values: dict[str, Any] = {name: value[None] for name, value in lens.lens(drawn).items()}
   values |= {"chosen": np.ones(1, bool), "fovy": np.array([fovy]), "seed": np.array([seed])}
-  values["far"] = far
-  for name in lens.PICTURES:
-    sent = pictures[name][None] if name in pictures else blank(lens.Lens, name, "cpu")
-    values[f"sent_{name}"] = values[name] = sent
-  view: Any = fill(lens.Lens, "cpu", values)
+  sizes = {"nrow": 1, "height": height, "width": width}
+  spare = tuple(name for name in Pictures.vars if name not in pictures)
+  sent, seen = (allocate(Pictures, "cpu", sizes, spare) for _ in range(2))
+  for name, value in pictures.items():
+    getattr(sent, name).assign(value[None])
+  view = fill(lens.Lens, "cpu", values | {"far": far, "sent": sent, "seen": seen})
   wp.launch(lens.see, dim=(1, height, width), inputs=[view, height, width], device="cpu")
-  return {name: getattr(view, name).numpy()[0] for name in pictures}
+  return {name: getattr(seen, name).numpy()[0] for name in pictures}
 
 
 def table() -> str:

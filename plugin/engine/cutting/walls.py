@@ -18,7 +18,7 @@ from ..model import flexes, mjstruct
 if TYPE_CHECKING:
   from ..model.declare import Declaration
 
-_LIP = 8e-4  # width of a lip [m]
+LIP = 8e-4  # width of a lip [m]
 _COUNTS = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
 
 
@@ -95,7 +95,7 @@ def _lips(mesh: topology.Mesh, disp: np.ndarray) -> tuple[np.ndarray, np.ndarray
   start, end, other = (x[topology.corners(mesh, half, k)] for k in range(3))
   along, inward = end - start, other - start
   inward -= ((inward * along).sum(1) / (along * along).sum(1))[:, None] * along
-  inward *= _LIP / np.linalg.norm(inward, axis=1, keepdims=True)
+  inward *= LIP / np.linalg.norm(inward, axis=1, keepdims=True)
   places = np.stack([start, end, end + inward, start + inward], axis=1).reshape(-1, 3)
   quads = 4 * np.arange(len(half))[:, None]
   return places, (quads + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3)
