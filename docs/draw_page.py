@@ -32,6 +32,7 @@ STATES = {
   "card": (WIDE, "[data-task='touch/easy']", {"d": 300}, True),
   "practice": (WIDE, "#tab-practice", {}, False),
   "line": (WIDE, "#tab-practice", {}, False),
+  "burn": (WIDE, "#tab-practice", {}, False),
   "phone": (PHONE, "[data-task='trace/easy']", {"d": 200}, False),
   "phone_home": (PHONE, None, {}, False),
 }
@@ -44,10 +45,11 @@ WebSocket.prototype.send = function(words) {
 };"""
 LOOK = """(() => {
   const {head, scene, targets} = window.palpate();
-  return {tip: [head.tip_x, head.tip_y, head.tip_z], mat: scene.camera.mat, targets};
+  return {force: head.force, tip: [head.tip_x, head.tip_y, head.tip_z], mat: scene.camera.mat, targets};
 })()"""
-MOVE = """move => window.program.send(JSON.stringify(
-  {type: "hand", which: "right", move, rate: [0, 0, 0, 0], buttons: []}))"""
+MOVE = """([move, buttons]) => window.program.send(JSON.stringify(
+  {type: "hand", which: "right", move, rate: [0, 0, 0, 0], buttons}))"""
+PRESS = 0.05  # of a hook on tissue [N]
 DEEP, HIGH = -0.004, 0.012  # of a blade over the line [m]
 CUT = 10  # marks along which it cuts
 
@@ -64,7 +66,7 @@ def cut(page) -> None:
         break
       way = np.reshape(now["mat"], (3, 3)).T @ way
       way *= min(2 * step / np.linalg.norm(way), 1)
-      page.evaluate(MOVE, [*map(float, way), 0.0])
+      page.evaluate(MOVE, [[*map(float, way), 0.0], []])
       page.wait_for_timeout(50)
 
 
@@ -79,7 +81,24 @@ def line(page) -> None:
   page.click("#draw")
 
 
-HANDS = {"cut": cut, "line": line}
+def burn(page) -> None:
+  """Goes along the organ with a hook whose current is on, and comes off it."""
+  deeper, along = [0, 0, -8e-4, 0], [3e-4, 0, 0, 0]
+  for _ in range(160):
+    if page.evaluate(LOOK)["force"] > PRESS:
+      break
+    page.evaluate(MOVE, [deeper, []])
+    page.wait_for_timeout(60)
+  for _ in range(80):
+    along[2] = -1e-4 if page.evaluate(LOOK)["force"] < 2 * PRESS else 5e-5
+    page.evaluate(MOVE, [along, ["grip"]])
+    page.wait_for_timeout(60)
+  for _ in range(8):
+    page.evaluate(MOVE, [[0, 0, 1e-3, 0], ["grip"]])
+    page.wait_for_timeout(60)
+
+
+HANDS = {"burn": burn, "cut": cut, "line": line}
 
 
 def draw(browser, url: str, name: str) -> None:
@@ -96,7 +115,7 @@ def draw(browser, url: str, name: str) -> None:
     page.click(start)
     if start == "#tab-practice":
       page.select_option("#organ", "gallbladder")
-      page.select_option("#instrument", "scalpel")
+      page.select_option("#instrument", "hook" if name == "burn" else "scalpel")
       page.click("#start")
     page.wait_for_selector("#stop:enabled", timeout=ANSWER)
     page.wait_for_timeout(3000)

@@ -79,6 +79,8 @@ class Camera:
     unknown = [each for each in outputs if each not in OUTPUTS]
     if unknown or not outputs:
       raise ValueError(f"outputs is {outputs!r}, expected some of {', '.join(OUTPUTS)}")
+    if not self.worlds:
+      raise ValueError(f"worlds is {worlds!r}, expected one or more")
     for world in self.worlds:
       batch.index(world)
     self._device, self._number, self._bodies = batch.device, camera, batch.poses()[2]

@@ -300,8 +300,9 @@ def _refuse(task: str, kwargs: Mapping[str, Any]) -> None:
   for name in {observation.TRUTH, *truth} & {*(kwargs.get("observations") or ())}:
     what = f"observations has {name!r}, which a vectorised exercise cannot do"
     raise NotVectorisedError(f"{task}: {what}; {_ELSE}")
-  for name, usual in (("record", None), ("model", None), ("input", "drives")):
-    if kwargs.get(name) and kwargs[name] != usual:
+  usual = (("record", None), ("model", None), ("renderer", None), ("input", "drives"))
+  for name, value in usual:
+    if kwargs.get(name) and kwargs[name] != value:
       what = f"{name} is given, which a vectorised exercise cannot do"
       raise NotVectorisedError(f"{task}: {what}; {_ELSE}")
 

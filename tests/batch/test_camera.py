@@ -250,6 +250,7 @@ def test_flow_of_tissue_is_that_of_its_stretch():
     (("eye", 8, 8, ("normals",)), r"outputs is \('normals',\), expected some of pixels, depth"),
     (("eye", 8, 8, ()), "outputs is"),
     (("eye", 8, 8, ("depth",), [2]), r"world is 2, expected one in \[0, 2\)"),
+    (("eye", 8, 8, ("depth",), []), r"worlds is \[\], expected one or more"),
   ],
 )
 def test_what_a_camera_cannot_be_is_named(args, message):

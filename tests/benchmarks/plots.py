@@ -40,10 +40,11 @@ def grid(rows: int, columns: int, width: float, height: float):
   for ax in axes.ravel():
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(labelsize=9)
+    ax.set_prop_cycle(color=COLOURS)
   return figure, axes[0] if rows == 1 else axes
 
 
-def plain(axis, least: float = 3):
+def plain(axis, least: float = 2.3):
   """Labels a logarithmic axis with plain numbers: 1, 2, 5, or decades if it spans more."""
   from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 

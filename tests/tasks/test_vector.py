@@ -290,6 +290,7 @@ def test_bad_input_is_named():
     ({"randomise": {"friction": (1, 2)}}, "randomise has 'friction'"),
     ({"record": True}, "record is given"),
     ({"input": "tip"}, "input is given"),
+    ({"renderer": "opengl"}, "renderer is given"),
   ):
     with pytest.raises(ValueError, match=f"{what}.*vectorization_mode"):
       make("touch/easy", **options)
