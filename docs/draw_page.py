@@ -82,7 +82,7 @@ def line(page) -> None:
 
 
 def burn(page) -> None:
-  """Goes along the organ with a hook whose current is on, and comes off it."""
+  """Goes along the organ with a hook whose current is on, and leaves it on."""
   deeper, along = [0, 0, -8e-4, 0], [3e-4, 0, 0, 0]
   for _ in range(160):
     if page.evaluate(LOOK)["force"] > PRESS:
@@ -93,9 +93,7 @@ def burn(page) -> None:
     along[2] = -1e-4 if page.evaluate(LOOK)["force"] < 2 * PRESS else 5e-5
     page.evaluate(MOVE, [along, ["grip"]])
     page.wait_for_timeout(60)
-  for _ in range(8):
-    page.evaluate(MOVE, [[0, 0, 1e-3, 0], ["grip"]])
-    page.wait_for_timeout(60)
+  page.evaluate(f"hand => setInterval(() => ({MOVE})(hand), 50)", [[0, 0, 0, 0], ["grip"]])
 
 
 HANDS = {"burn": burn, "cut": cut, "line": line}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import pathlib
 from collections.abc import Sequence
 
@@ -24,6 +25,7 @@ STYLES = {
 # Of curves and bars: the colour-blind tell them apart too (Okabe and Ito 2008).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 MARKS = "osD^vPX"
+WIDE = 1280  # of a figure, at least [pixels]
 MANY = 16  # names of bars that stand in one column
 
 
@@ -35,7 +37,8 @@ def grid(rows: int, columns: int, width: float, height: float):
     raise CommandError(
       "matplotlib is not installed: pip install 'palpate[plot]'; the rows are kept", code=1
     ) from None
-  figure = Figure(figsize=(width, height), dpi=140, layout="constrained")
+  dpi = max(140, math.ceil(WIDE / width))
+  figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
   axes = figure.subplots(rows, columns, squeeze=False)
   for ax in axes.ravel():
     ax.spines[["top", "right"]].set_visible(False)
