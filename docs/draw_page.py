@@ -89,7 +89,7 @@ def burn(page) -> None:
       break
     page.evaluate(MOVE, [deeper, []])
     page.wait_for_timeout(60)
-  for _ in range(80):
+  for _ in range(45):
     along[2] = -1e-4 if page.evaluate(LOOK)["force"] < 2 * PRESS else 5e-5
     page.evaluate(MOVE, [along, ["grip"]])
     page.wait_for_timeout(60)

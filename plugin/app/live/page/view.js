@@ -10,7 +10,7 @@ const LIP = 8e-4;  // width of the edge of a cut [m]
 const BESIDE = 0.006;  // from the lens to its lamp [m]
 const EXPERT = 0x59f2bf;
 const SHADES = 4, DARK = 0.6, SOFT = 0.006, LONG = 0.05;  // contact shadows: most, depth, reach [m], length of shaft [m]
-const PUFFS = 24;  // of smoke
+const PUFFS = 24, LASTS = 1.6;  // of smoke, and how long [s]
 const NEAR = 0.005, FAR = 2;  // [m]
 // A scene's lights fade as MuJoCo's do, a + b d^2; `distance` and `decay` of a light carry a and b.
 THREE.ShaderChunk.lights_pars_begin = THREE.ShaderChunk.lights_pars_begin.replace(
@@ -309,26 +309,24 @@ export class View {
   // Smoke rises from where a hook's current acts.
   fume(burns, frame, places) {
     const now = performance.now() / 1e3, {smoke, scene} = this;
-    if (burns && scene.hooks.length) {
-      const [body, ...at] = scene.hooks[0];
-      this.blood.burn(new THREE.Vector3(...at).applyMatrix4(pose(new THREE.Matrix4(), frame.subarray(places + BODY * body))), this.nodes);
-    }
-    if (burns && scene.hooks.length && now - this.blown > 0.06) {
-      const [body, ...at] = scene.hooks[0], puff = smoke[this.puffed++ % PUFFS];
-      const from = pose(new THREE.Matrix4(), frame.subarray(places + BODY * body));
-      puff.position.set(...at).applyMatrix4(from);
-      const away = () => 0.004 * (Math.random() - 0.5);
-      puff.userData = {born: now, speed: [away(), away(), 0.018 + away()], at: puff.position.clone()};
-      puff.visible = true;
-      this.blown = now;
+    this.blown = burns && scene.hooks.length ? Math.max(this.blown, now - LASTS) : now;
+    if (this.blown < now) {
+      const [body, ...tip] = scene.hooks[0];
+      const at = new THREE.Vector3(...tip).applyMatrix4(pose(new THREE.Matrix4(), frame.subarray(places + BODY * body)));
+      this.blood.burn(at, this.nodes);
+      for (; now - this.blown > LASTS / PUFFS; this.blown += LASTS / PUFFS) {  // several, where pictures are far apart
+        const puff = smoke[this.puffed++ % PUFFS], away = () => 0.004 * (Math.random() - 0.5);
+        puff.userData = {born: this.blown, speed: [away(), away(), 0.018 + away()], at};
+        puff.visible = true;
+      }
     }
     for (const puff of smoke) {
       if (!puff.visible) continue;
       const {born, speed, at} = puff.userData, age = now - born;
-      puff.visible = age < 1.6;
+      puff.visible = age < LASTS;
       puff.position.set(at.x + speed[0] * age, at.y + speed[1] * age, at.z + speed[2] * age);
       puff.scale.setScalar(0.004 + 0.014 * age);
-      puff.material.opacity = 0.4 * Math.max(1 - age / 1.6, 0);
+      puff.material.opacity = 0.4 * Math.max(1 - age / LASTS, 0);
     }
   }
 
