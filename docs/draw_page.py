@@ -45,7 +45,8 @@ WebSocket.prototype.send = function(words) {
 };"""
 LOOK = """(() => {
   const {head, scene, targets} = window.palpate();
-  return {force: head.force, tip: [head.tip_x, head.tip_y, head.tip_z], mat: scene.camera.mat, targets};
+  const {force, tip_x, tip_y, tip_z} = head;
+  return {force, tip: [tip_x, tip_y, tip_z], mat: scene.camera.mat, targets};
 })()"""
 MOVE = """([move, buttons]) => window.program.send(JSON.stringify(
   {type: "hand", which: "right", move, rate: [0, 0, 0, 0], buttons}))"""

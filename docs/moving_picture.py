@@ -1,6 +1,6 @@
-"""Writes the moving picture of the README, a film with fewer and smaller frames.
+"""Writes the moving picture of the README, a film with fewer frames.
 
-palpate exercise dissect/easy --film dissect.mp4
+palpate exercise dissect/easy --film dissect.mp4 --size 1280x960
 python docs/moving_picture.py dissect.mp4 docs/pictures/dissect_easy.webp
 """
 
@@ -13,10 +13,8 @@ source, target = sys.argv[1:]
 with imageio.get_reader(source) as film:
   step = 2
   delay = 1000 * step / film.get_meta_data()["fps"]  # [ms]
-  first, *rest = [
-    Image.fromarray(frame).resize((480, 360)) for k, frame in enumerate(film) if k % step == 0
-  ]
+  first, *rest = [Image.fromarray(frame) for k, frame in enumerate(film) if k % step == 0]
 delays = [delay] * len(rest) + [1000]  # the end stays for a second
 first.save(
-  target, save_all=True, append_images=rest, duration=[*map(round, delays)], loop=0, quality=60
+  target, save_all=True, append_images=rest, duration=[*map(round, delays)], loop=0, quality=40
 )

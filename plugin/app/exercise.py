@@ -18,7 +18,6 @@ from .console import CommandError, Interrupt, Progress, output, output_folder, w
 from .draw import film
 from .trainee import keeping
 
-_SIZE = (640, 480)  # of the film [pixels]
 _SMALL = (320, 240)  # of each picture at the top of a report
 
 
@@ -50,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser):
     "the record)",
   )  # fmt: skip
   add("--film", metavar="FILE", help="write a film too, .mp4 or .gif")
+  add("--size", metavar="WxH", default="640x480", help="of the film [pixels] (%(default)s)")
   options.add_argument(parser)
   keeping.add_arguments(parser)
   add("--states", action="store_true", help="store the state of every step in the recording")
@@ -79,7 +79,9 @@ def main(args: argparse.Namespace) -> int:
   job = _prepare(args)
   progress, failure, views = Progress(), None, _views(args, job)
   camera = contextlib.nullcontext(views)
-  with Interrupt() as interrupt, film.laparoscope(job.film, _SIZE) if job.film else camera as shoot:
+  if job.film:
+    camera = film.laparoscope(job.film, job.size)
+  with Interrupt() as interrupt, camera as shoot:
 
     def watch(env) -> bool:
       progress.show(f"{job.name} {env.physics.time():.1f} s, {100 * env.task.best:.0f} % done")
@@ -175,6 +177,7 @@ class _Job:
     old: the recording that is replayed, None for a new one
     folder: of the files, None where they are in a record alone
     film: file of the film, None without one
+    size: its width and height [pixels]
     references: what finds the references of tasks
     sitting: of a record, None without one
     path: of the file in it
@@ -186,6 +189,7 @@ class _Job:
   old: Any
   folder: pathlib.Path | None
   film: pathlib.Path | None
+  size: tuple[int, int]
   references: Any
   sitting: keeping.Sitting | None
   path: pathlib.Path | None
@@ -218,7 +222,8 @@ def _prepare(args: argparse.Namespace) -> _Job:
   shot = output("film", args.film, film.FILMS) if args.film else None
   if shot:
     film.check(shot.suffix)
-  return _Job(name, seed, run, old, folder, shot, references, sitting, path)
+  size = film.size(args.size)
+  return _Job(name, seed, run, old, folder, shot, size, references, sitting, path)
 
 
 def _replay(path: str):

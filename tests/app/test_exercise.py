@@ -79,8 +79,8 @@ def test_films(tmp_path, capsys):
   """One of an episode as it goes, and one in its report on request."""
   pytest.importorskip("imageio_ffmpeg")
   words = ["exercise", "touch/easy", "--set", "time_limit=0.4", "--no-report", "--out", "a"]
-  assert cli.main([*words, "--film", "a.gif"]) == 0
-  assert (tmp_path / "a.gif").read_bytes()[:3] == b"GIF"
+  assert cli.main([*words, "--film", "a.gif", "--size", "160x120"]) == 0
+  assert (tmp_path / "a.gif").read_bytes()[:10] == b"GIF89a" + bytes([160, 0, 120, 0])
   assert cli.main(["report", "a/recording.npz", "--film"]) == 0
   page = (tmp_path / "a" / "report.html").read_text()
   data = re.search(r"<video [^>]*src='data:video/mp4;base64,([^']*)'", page)[1]
@@ -128,6 +128,7 @@ def test_a_stopped_recording_replays_with_its_outcome(tmp_path, capsys, monkeypa
     (["--out", "file"], "out: cannot write 'file': "),
     (["--film", "file/a.mp4"], "film: cannot write 'file': "),
     (["--film", "a.avi"], "film is 'a.avi', expected a name that ends in .mp4 or .gif"),
+    (["--film", "a.gif", "--size", "9x9"], "size is '9x9', expected WxH such as 1280x960"),
   ],
 )
 def test_outputs_that_cannot_be_written_are_said_before_the_work(

@@ -19,6 +19,16 @@ if TYPE_CHECKING:
 FILMS = (".mp4", ".gif")
 PICTURES = (".png", ".webp", ".jpg")
 _FPS = 25  # of the laparoscope
+_MOST_PIXELS = 8192
+
+
+def size(text: str) -> tuple[int, int]:
+  """Returns width and height [pixels] of a text such as 1280x960."""
+  words = text.lower().split("x")
+  if len(words) != 2 or not all(w.isdigit() and 16 <= int(w) <= _MOST_PIXELS for w in words):
+    span = f"[16, {_MOST_PIXELS}]"
+    raise CommandError(f"size is {text!r}, expected WxH such as 1280x960, both in {span}")
+  return int(words[0]), int(words[1])
 
 
 @contextlib.contextmanager

@@ -12,7 +12,6 @@ from palpate import register
 from ..console import CommandError, Interrupt, Progress, output
 from . import film
 
-_MOST_PIXELS = 8192
 _FORCE = 0.1  # length of an arrow that is a newton [m]
 _WIDTH = 0.0015  # of an arrow [m]
 _ARROW = np.array([1.0, 0.85, 0.2, 1.0], np.float32)
@@ -74,10 +73,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> tuple[int, int]:
   """Returns width and height."""
-  words = args.size.lower().split("x")
-  if len(words) != 2 or not all(w.isdigit() and 16 <= int(w) <= _MOST_PIXELS for w in words):
-    span = f"[16, {_MOST_PIXELS}]"
-    raise CommandError(f"size is {args.size!r}, expected WxH such as 1280x960, both in {span}")
+  size = film.size(args.size)
   for name, most in (("seconds", 600.0), ("slower", 100.0)):
     value = getattr(args, name)
     if value is not None and not (math.isfinite(value) and 0 <= value <= most):
@@ -86,7 +82,7 @@ def _check(args: argparse.Namespace) -> tuple[int, int]:
     raise CommandError("slower is 0, expected a number in (0, 100]")
   if not 1 <= args.fps <= 240:
     raise CommandError(f"fps is {args.fps}, expected a whole number in [1, 240]")
-  return int(words[0]), int(words[1])
+  return size
 
 
 def _camera(model, name: str | None) -> int | str:
