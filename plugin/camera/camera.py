@@ -19,7 +19,7 @@ from .host import Host
 from .lens import Lens, lens, see
 from .scene import Scene, colour, labelled, site_size, texture
 from .soft import Surface
-from .view import LARGEST, NOTHING, Pictures, View
+from .view import NOTHING, Pictures, View
 
 if TYPE_CHECKING:
   from palpate.engine.model.declare import Declaration
@@ -32,7 +32,7 @@ MOST = 1024  # height and width [pixels]
 _VERTEX, _TRIANGLE = 36.0, 13.0  # bytes that a row has for those of organs
 _BLOCK = 64  # threads of a block
 _SOME = 2**22  # pixels whose nearest triangles are kept at a time
-_LITTLE = 128  # pixels around a triangle that one thread of a GPU goes through alone
+_LITTLE = 32  # pixels; a thread of a GPU goes through twice as many around a triangle
 _TILE = 32  # pixels that are drawn side by side
 _FINE = 128  # height of a picture from which skins are as fine as they are declared [pixels]
 
@@ -140,10 +140,9 @@ class Camera:
     through = some * any(part.clear for part in self.scene.parts)
     for name, rows in (("solid", some), ("clear", through)):
       values[name] = wp.full((rows, *size), NOTHING, dtype=wp.uint64, device=self._device)
-    large = (some, LARGEST)
-    little = _LITTLE if self._device.is_cuda else MOST * MOST
-    values |= {"little": little, "nlarge": np.zeros(n, np.int32)}
-    values |= {"large": np.zeros(large, np.int32), "large_at": np.zeros((*large, 3, 3))}
+    large = -(-size[0] * size[1] // _LITTLE) if self._device.is_cuda else 0
+    values |= {"little": 2 * _LITTLE if large else MOST * MOST, "nlarge": np.zeros(n, np.int32)}
+    values["large"] = np.zeros((some, large, 3), np.int32)
     return values
 
   def _rows(self, values: Any) -> np.ndarray:
@@ -350,6 +349,9 @@ class Camera:
       for start in range(0, n, c.solid.shape[0]):
         some = min(c.solid.shape[0], n - start)
         wp.launch(filling.fill, dim=(some, c.thing.shape[0]), inputs=[c, start])
+        if c.large.shape[1] > 0:
+          lanes = (some, c.large.shape[1], filling.LANES)
+          wp.launch(filling.spread, dim=lanes, inputs=[c, start])
         wp.launch(shading.draw, dim=(some, tiles, _TILE), inputs=[c, start], block_dim=_BLOCK)
       if self.lens is not None:
         wp.launch(see, dim=(n, c.height, c.width), inputs=[self.lens, c.height, c.width])

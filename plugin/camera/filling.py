@@ -1,17 +1,19 @@
 """Where everything is in rows, and which triangle each pixel shows.
 
 A row is a world that is drawn. `fill` enters every triangle in the pixels whose rays meet it; the
-nearest one stays. Triangles that cover many pixels are left to `shading.draw`, where all pixels of
-a row try them side by side.
+nearest one stays. Triangles that cover many pixels are left to `spread`, where a warp of a GPU goes
+through their pixels.
 """
 
 import warp as wp
 
-from .view import LARGEST, NOTHING, Soft, View
+from .view import NOTHING, Soft, View
 
+LANES = 32  # that go through a large triangle
+_LANES = wp.constant(LANES)
 _OPAQUE = wp.constant(0.995)
 _NOTHING = wp.constant(wp.uint64(NOTHING))
-_LARGEST = wp.constant(LARGEST)
+_SIDE = wp.constant(2**15)  # beyond any line and column
 
 
 @wp.kernel(enable_backward=False)
@@ -216,9 +218,8 @@ def fill(c: View, first: int):
     return
   if (i1 - i0 + 1) * (j1 - j0 + 1) > c.little and not clear:
     k = wp.atomic_add(c.nlarge, r, 1)
-    if k < _LARGEST:
-      c.large[row, k] = f
-      c.large_at[row, k] = m
+    if k < c.large.shape[1]:
+      c.large[row, k] = wp.vec3i(f, i0 * _SIDE + i1, j0 * _SIDE + j1)
       return
   for i in range(i0, i1 + 1):
     for j in range(j0, j1 + 1):
@@ -228,3 +229,21 @@ def fill(c: View, first: int):
           wp.atomic_min(c.clear, row, i, j, key)
         else:
           wp.atomic_min(c.solid, row, i, j, key)
+
+
+@wp.kernel(enable_backward=False)
+def spread(c: View, first: int):
+  """Enters a large triangle in its pixels, as many side by side as there are lanes."""
+  row, k, lane = wp.tid()
+  r = first + row
+  if not c.chosen[r] or k >= c.nlarge[r]:
+    return
+  large, pixel = c.large[row, k], c.pixel[r]
+  m = corners(c, r, large[0])
+  i0, j0 = large[1] / _SIDE, large[2] / _SIDE
+  width = large[2] % _SIDE - j0 + 1
+  for p in range(lane, (large[1] % _SIDE - i0 + 1) * width, _LANES):
+    i, j = i0 + p / width, j0 + p % width
+    key = key_at(c, m, large[0], ray_of(c, pixel, i, j))
+    if key != _NOTHING:
+      wp.atomic_min(c.solid, row, i, j, key)

@@ -85,7 +85,7 @@ class Scene:
 
   Attributes:
     things: what is drawn
-    parts: surfaces of bodies; the first is the world's, and may be empty
+    parts: surfaces of bodies; the first is the world's, a triangle without area where it has none
     texels: textures, see `textures.pack`
     images: where these are
     sky: texture of the sky, -1 for none
@@ -107,10 +107,11 @@ class Scene:
         name = mujoco.mj_id2name(model, _OBJ.mjOBJ_FLEX, f)
         raise ValueError(f"flex {name!r} is no organ's; a camera of a batch draws organs alone")
     clear = self.parts
+    self._solid[0] = self._solid[0] or [(_NOTHING, 0)]
     self.parts = [
       Part(
-        shapes.joined([s for s, _ in found]) if found else _NOTHING,
-        np.repeat([thing for _, thing in found], [len(s.face) for s, _ in found]).astype(int),
+        shapes.joined([s for s, _ in found]),
+        np.repeat([k for _, k in found], [len(s.face) for s, _ in found]),
         body,
       )
       for body, found in self._solid.items()

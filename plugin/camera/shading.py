@@ -11,14 +11,13 @@ import warp as wp
 from palpate.engine.cutting.walls import LIP
 from palpate.tissue.types import struct
 
-from .filling import corners, distance, key_at, ray_of, shares
+from .filling import corners, distance, ray_of, shares
 from .textures import CUBE, LEVELS
-from .view import LARGEST, NOTHING, View
+from .view import NOTHING, View
 
 _CUBE, _LEVELS = wp.constant(CUBE), wp.constant(LEVELS)
 _SPOT = wp.constant(0)  # mjtLightType
 _NOTHING = wp.constant(wp.uint64(NOTHING))
-_LARGEST = wp.constant(LARGEST)
 _LIP = wp.constant(LIP)
 
 
@@ -246,8 +245,6 @@ def draw(c: View, start: int):
   o = c.eye[r]
   nearest = c.solid[row, i, j]
   c.solid[row, i, j] = _NOTHING
-  for l in range(wp.min(c.nlarge[r], _LARGEST)):
-    nearest = wp.min(nearest, key_at(c, c.large_at[row, l], c.large[row, l], at))
   solid, clear = met(c, r, nearest, at), nothing()
   if c.clear.shape[0] > 0:
     key = c.clear[row, i, j]

@@ -7,7 +7,6 @@ from palpate.tissue.types import Array, floats, ints, struct
 from .textures import LEVELS
 
 NOTHING = 2**64 - 1  # what a pixel has met before a picture
-LARGEST = 64  # large triangles of a row that are kept
 
 
 @struct
@@ -53,7 +52,7 @@ class View:
 
   height: int
   width: int
-  little: int  # pixels around a triangle from which on it is large
+  little: int  # pixels around a triangle beyond which it is large
   near: float  # distances that are drawn [m]
   far: float
   world: ints("nrow")
@@ -127,7 +126,7 @@ class View:
   # What pixels of some rows have met: distance, as an integer's upper half, and triangle.
   solid: Array(wp.uint64, ("nsome", "height", "width"))
   clear: Array(wp.uint64, ("nsome", "height", "width"))  # empty where nothing lets one through
-  nlarge: ints("nrow")  # large triangles of a row, which `draw` tries in every pixel
-  large: ints("nsome", LARGEST)
-  large_at: Array(wp.mat33, ("nsome", LARGEST))  # their corners in the camera's frame
+  # Large triangles of a row: their number, and of each its lines and its columns, first and last.
+  nlarge: ints("nrow")
+  large: Array(wp.vec3i, ("nsome", "nlarge"))
   out: Pictures

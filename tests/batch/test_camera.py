@@ -5,6 +5,7 @@ import numpy as np
 import palpate
 import palpate.batch
 import pytest
+import warp as wp
 from devices import needs_cuda
 from palpate.camera import Camera
 from palpate.camera.host import Single
@@ -130,6 +131,19 @@ def test_cuda_draws_what_the_cpu_draws(name):
     for key in ("depth", "points"):
       assert (np.abs(cpu[key] - gpu[key]) < 1e-5).mean() > 0.9999
     assert np.abs(cpu["pixels"].astype(float) - gpu["pixels"]).mean() < 0.01
+
+
+@pytest.mark.parametrize("room", [3, 3000])
+def test_large_triangles_are_drawn_by_many_threads_as_by_one(room):
+  """As on a GPU; what has no room there is drawn by one."""
+  camera = exercise("grasp/easy", 2, "warp-cpu").camera("laparoscope", SIZE, SIZE, OUTPUTS)
+  expected = {name: array.numpy().copy() for name, array in camera.draw().items()}
+  camera.view.little, some = 20, len(camera.view.solid)
+  camera.view.large = wp.zeros((some, room), dtype=wp.vec3i, device=camera.view.large.device)
+  found = camera.draw()
+  assert (camera.view.nlarge.numpy() > 100).all()
+  for name in OUTPUTS:
+    np.testing.assert_array_equal(found[name].numpy(), expected[name])
 
 
 def test_cuts_open_and_heal():
