@@ -37,6 +37,7 @@ class Eyes:
     host = Single(physics.model.ptr, self.data, device)
     lenses = [0] * len(shift)  # a row a lens
     self._camera = Camera(host, CAMERA, height, width, outputs, lenses, labels, shift)
+    self._shown = dict[str, np.ndarray]()
 
   def see(self, physics: Any, begins: bool) -> dict[str, np.ndarray]:
     """Returns what each lens sees now, by what `Camera` calls it  (lens, height, width, ...).
@@ -47,8 +48,10 @@ class Eyes:
     """
     camera, model = self._camera, physics.model.ptr
     rows = np.arange(len(camera.worlds))
-    values = camera.look(model) | camera.sites(model)
-    camera.show(rows, {name: np.stack([value] * len(rows)) for name, value in values.items()})
+    for name, value in (camera.look(model) | camera.sites(model)).items():
+      if not np.array_equal(value, self._shown.get(name, ())):
+        self._shown[name] = np.array(value)
+        camera.show(rows, {name: np.stack([value] * len(rows))})
     if begins:
       camera.place()
     return {name: array.numpy().copy() for name, array in camera.draw().items()}
