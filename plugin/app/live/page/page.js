@@ -218,8 +218,9 @@ function teach() {
 function without(error) {
   document.body.dataset.mode = "exercise";  // nothing below the import of the view has run
   const film = document.createElement("code"), picture = new Image(), task = asked.get("task") ?? "touch/easy";
-  film.textContent = `palpate render ${task} --seconds 10 -o film.mp4`;
+  film.textContent = `palpate exercise ${task} --film film.mp4`;
   picture.src = `cards/${task.replace("/", "_")}.webp`;
+  $("look").hidden = $("pad").hidden = true;
   $("welcome").replaceChildren(t("This browser draws no WebGL 2"), picture,
     t("Switch on its hardware acceleration, or try another browser. The exercise as a film, from the command line:"), film);
   console.warn(error);
