@@ -133,6 +133,13 @@ def on_lip(c: View, r: int, f: int, hit: Hit):
     found = True
   if (open & 4) != 0 and hit.v * twice < _LIP * wp.length(a - e):
     found = True
+  p = hit.u * a + hit.v * b + w * e  # a lip goes on into triangles that it only meets at a corner
+  if (open & 8) != 0 and wp.length(p - a) < _LIP:
+    found = True
+  if (open & 16) != 0 and wp.length(p - b) < _LIP:
+    found = True
+  if (open & 32) != 0 and wp.length(p - e) < _LIP:
+    found = True
   return found
 
 

@@ -156,6 +156,9 @@ def test_cuts_open_and_heal():
   assert np.abs(seen["flow"].numpy()).max() < 10.0  # cuts have made vertices since
   compare(batch, 0, "laparoscope", seen)
   cut = compare(batch, 1, "laparoscope", seen)
+  lip, expected = [batch.model.nflex - 1, mj.mjtObj.mjOBJ_FLEX], rendered(batch, 1, "laparoscope")
+  mine, theirs = ((each["segmentation"] == lip).all(axis=-1) for each in (cut, expected))
+  assert (mine & theirs).sum() > 0.7 * (mine | theirs).sum()  # a pixel wide
   lips = (cut["segmentation"] != whole["segmentation"][1]).any(axis=-1)
   assert 20 < lips.sum() < 200
   before, after = (each[lips].mean() for each in (whole["pixels"][1], cut["pixels"]))
