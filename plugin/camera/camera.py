@@ -32,7 +32,7 @@ MOST = 1024  # height and width [pixels]
 _VERTEX, _TRIANGLE = 36.0, 13.0  # bytes that a row has for those of organs
 _BLOCK = 64  # threads of a block
 _SOME = 2**22  # pixels whose nearest triangles are kept at a time
-_LITTLE = 32  # pixels; a thread of a GPU goes through twice as many around a triangle
+_LITTLE = 64  # pixels; a thread of a GPU goes through twice as many around a triangle
 _TILE = 32  # pixels that are drawn side by side
 _FINE = 128  # height of a picture from which skins are as fine as they are declared [pixels]
 
