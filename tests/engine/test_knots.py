@@ -57,27 +57,29 @@ def test_hands_that_pull_a_thread_taut_come_to_rest():
 
 
 @pytest.mark.parametrize(
-  ("turns", "holds"),
+  ("turns", "material", "holds"),
   [
-    ((1,), False),
-    pytest.param((1, 1), False, marks=pytest.mark.slow),
-    ((1, -1), True),
-    pytest.param((2, -1, 1), True, marks=pytest.mark.slow),
+    ((1,), "silk", False),
+    pytest.param((1, 1), "silk", False, marks=pytest.mark.slow),
+    ((1, -1), "silk", True),
+    pytest.param((1, -1), "polypropylene", False, marks=pytest.mark.slow),
+    pytest.param((2, -1, 1), "silk", True, marks=pytest.mark.slow),
+    pytest.param((2, -1, 1), "vicryl", True, marks=pytest.mark.slow),
   ],
 )
-def test_silk_knots_hold_or_slip(turns, holds):
-  """Silk holds in a square knot of two throws (Karaca and Hockenberger 2001).
+def test_knots_hold_or_slip(turns, material, holds):
+  """Silk holds in a square knot of two throws, polypropylene does not.
 
-  doi:10.1177/004051750107100511. A single throw slips as soon as its ends are let go, and so does a
-  granny set with 2 N.
+  Karaca and Hockenberger 2001, doi:10.1177/004051750107100511. A single throw slips as soon as its
+  ends are let go, and so does a granny set with 2 N.
   """
   axis = np.array([1.0, 0, 0])
   points, *_ = throws(turns, RADIUS, 2.5 * RADIUS)
   assert sorted(knots.throws(knots.closed(points, axis))) == sorted(turns)
-  held, slip, thread = pull_test(turns)
+  held, slip, thread = pull_test(turns, material)
   if holds:
     assert held == pytest.approx(0.8)
-    assert slip < 1.5e-3  # the strands tighten
+    assert slip < 2.5e-3  # the strands tighten
     assert knots.name(knots.closed(thread.positions, axis)) == knots.NAMES[turns]
     pulled = thread.data.joint("hand_0").qpos[0]
     mujoco.mj_step(thread.model, thread.data, 200)
