@@ -39,6 +39,7 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "regrasped": (),
   "ring_time": (),
   "ring_force": (),
+  "bite": (),
 }
 # Those that are measured faster: with substeps, magnitudes, one for each since the last sample.
 SIGNALS = ("force", "grip_force", "shaft_force", "surroundings_force")

@@ -219,7 +219,8 @@ class Recorder:
         more than 2 mm off [m], `depth`, of the blade under the wall at most [m]; `current`, time
         that one was on so far [s], and `idle_current` without touching what it is to free [s];
         `regrasped`, how often the needle was taken so far, `ring_time`, how long rings were touched
-        [s], and `ring_force`, with how much at most [N]
+        [s], and `ring_force`, with how much at most [N]; `bite`, how deep a needle went under a
+        wall [m]
     """
     time = float(time)
     if not (math.isfinite(time) and time > self._last):

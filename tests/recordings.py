@@ -46,6 +46,7 @@ def exercise(steps=300, instruments=("left", "right"), seed=0, journal=None):
       idle_current=rng.rand(len(instruments)),
       regrasped=rng.rand(len(instruments)),
       ring_time=rng.rand(len(instruments)),
+      bite=rng.rand(len(instruments)),
       ring_force=rng.rand(len(instruments)),
       grip=np.full(len(instruments), k % 100 < 60),
       held=np.full(len(instruments), 10 < k % 100 < 40),

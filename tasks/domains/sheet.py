@@ -1,4 +1,4 @@
-"""The scene of `cut`: a sheet of tissue in a frame, and the line that is marked on it.
+"""The scene of `cut` and `drive`: a sheet of tissue in a frame.
 
 World: z is up, the sheet lies in z = 0 and is held along its four sides.
 """
@@ -53,11 +53,27 @@ def sheet(nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def build(scene: Scene) -> mujoco.MjSpec:
-  """Returns the scene, ready to be compiled; what cuts is the instrument's `edge`."""
+  """Returns the scene of `cut`, ready to be compiled; what cuts is the instrument's `edge`."""
+  tissue = _TISSUE | {"cutters": f"{scene.instrument}/edge {ENERGY}"}
+  spec = stretched(scene, tissue, _MASS, spare=_SPARE)
+  spec.option.gravity = np.zeros(3)
+  return spec
+
+
+def stretched(
+  scene: Scene, tissue: dict, mass: float, spare: float = 0.0, slots: int | None = None
+) -> mujoco.MjSpec:
+  """Returns a sheet in its frame, with instruments, light and what is around.
+
+  Args:
+    scene: what it plays in
+    tissue: keys of the organ
+    mass: of the sheet [kg]
+    spare: room for a cut, times the square root of the nodes
+    slots: of the window, see `scenes.furnish`
+  """
   vertices, triangles = sheet(scene.nodes)
-  spare = round(_SPARE * np.sqrt(len(vertices)))
-  config = _TISSUE | {"device": "cpu", "tolerance": scenes.TOLERANCE}
-  config |= {"cutters": f"{scene.instrument}/edge {ENERGY}"}
+  config = tissue | {"device": "cpu", "tolerance": scenes.TOLERANCE}
   flex = mjcf.flexcomp(
     scenes.ORGAN,
     (vertices, triangles),
@@ -65,14 +81,14 @@ def build(scene: Scene) -> mujoco.MjSpec:
     contact=scenes.CONTACT,
     pin=np.flatnonzero(np.abs(vertices).max(axis=1) > SIZE / 2 - 1e-6),
     digits=7,
-    mass=_MASS,
+    mass=mass,
     radius=_SKIN,
     rgba=_COLOUR,
   )
   inside = scene.surroundings == "abdomen"
-  spec = scenes.furnish(scene, flex, np.zeros(3), _frame(seen=not inside))
-  palpate.add_spare(spec, scenes.ORGAN, spare)
-  spec.option.gravity = np.zeros(3)
+  spec = scenes.furnish(scene, flex, np.zeros(3), _frame(seen=not inside), slots)
+  if spare:
+    palpate.add_spare(spec, scenes.ORGAN, round(spare * np.sqrt(len(vertices))))
   if inside:
     situs.dress(spec, scenes.ORGAN, "wall", vertices[:, :2] / 0.15)
     situs.draw(spec, "abdomen_border", _border(), situs.paint(spec, "fat"))

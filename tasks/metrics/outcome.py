@@ -186,6 +186,16 @@ def peak_ring_force(ring_force: ArrayLike) -> float:
   return float(rows("ring_force", ring_force)[-1])
 
 
+@metric("Depth of the bite", "m", "outcome", "all", "FLS task 4: bites", better="neither")
+def bite_depth(bite: ArrayLike) -> float:
+  """Returns how deep a needle went under a wall [m], neither is better.
+
+  Args:
+    bite: deepest so far [m]  (nstep,)
+  """
+  return float(rows("bite", bite)[-1])
+
+
 @metric("Tracing error (Frechet)", "m", "outcome", "all", "Perk Tutor; Eiter and Mannila 1994")
 def trace_frechet(traced_pos: ArrayLike, curve: ArrayLike) -> float:
   """Returns the discrete Frechet distance of the tip's path to a curve [m], lower is better.

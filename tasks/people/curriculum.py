@@ -34,6 +34,9 @@ AFTER |= {
   "needle/transfer_easy": "grasp/easy",
   "needle/transfer_standard": "needle/transfer_easy",
   "needle/transfer_hard": "needle/transfer_standard",
+  "suture/drive_easy": "needle/transfer_easy",
+  "suture/drive_standard": "suture/drive_easy",
+  "suture/drive_hard": "suture/drive_standard",
   "probe/palpate_hard": "probe/palpate_standard",
 }
 RULE = f"{CONSECUTIVE} proficient attempts in a row and {REPEATS} more"

@@ -139,6 +139,21 @@ def test_two_hands_move_two_instruments_and_what_they_do_replays(tmp_path):
   assert episode.differences(old, episode.replay(old)) == []
 
 
+def test_a_needle_stays_in_the_jaws_until_the_hand_has_closed_them_and_opens():
+  """By the pose of the tip: the jaws are turned as they were, whatever way the hand goes."""
+  assert suite.by_hand("suture/drive_easy") == "tip"
+  env, held = load("suture/drive_easy", input="tip", time_limit=2), []
+  closed = lambda t: frozenset({"grip"} if 0.4 < t < 0.6 else ())  # noqa: E731
+  hand = live.Hand(lambda t: (0.0, 0.01 * t, 0.0), buttons=closed)
+  look = lambda env: held.append((env.physics.time(), env.task.holds))  # noqa: E731
+  made = session(env, hand).run(watch=look)
+  assert made.outcome == "missed"  # it fell
+  assert all(holds for time, holds in held if time < 0.6)
+  assert not held[-1][1]
+  early = made.columns["quat"][made.time < 0.5, 0]
+  np.testing.assert_allclose(np.abs(early @ early[0]), 1.0, atol=1e-4)
+
+
 def test_hands_are_as_many_as_the_exercise_takes():
   with pytest.raises(ValueError, match="bimanual/easy: it takes two hands, expected another"):
     live.Session(load("bimanual/easy"), live.Hand())

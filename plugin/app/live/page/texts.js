@@ -29,7 +29,8 @@ const GERMAN = {
   "next": "als Nächstes", "done": "geschafft", "proficient": "sicher", "open": "offen", "after {0}": "nach {0}", "{0} of {1} attempts proficient": "{0} von {1} Versuchen sicher",
   "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate_easy": "Tasten, leicht", "palpate_standard": "Tasten, mittel", "palpate_hard": "Tasten, schwer",
   "touch": "Berühren", "probe": "Drücken und Tasten", "trace": "Nachfahren", "grasp": "Greifen", "retract": "Weghalten", "tease": "Ablösen",
-  "dissect": "Abpräparieren", "cut": "Schneiden", "bimanual": "Mit zwei Händen", "navigate": "Kamera führen", "needle": "Nadel übergeben",
+  "dissect": "Abpräparieren", "cut": "Schneiden", "bimanual": "Mit zwei Händen", "navigate": "Kamera führen", "needle": "Nadel übergeben", "suture": "Nähen",
+  "drive_easy": "Durchstechen, leicht", "drive_standard": "Durchstechen, mittel", "drive_hard": "Durchstechen, schwer",
   "transfer_easy": "Übergeben, leicht", "transfer_standard": "Übergeben, mittel", "transfer_hard": "Übergeben, schwer",
   // What runs.
   "Loading {0}": "Lädt {0}", "Loading {0}, which takes a minute or more": "Lädt {0}, das dauert eine Minute oder mehr",
@@ -89,7 +90,9 @@ const GERMAN = {
   "Bring the needle's blunt end through ring # of #": "Führe das stumpfe Ende der Nadel durch Ring # von #", "Pull it through": "Zieh sie hindurch",
   "Take the needle with the left hand": "Nimm die Nadel mit der linken Hand", "Take the needle with the right hand": "Nimm die Nadel mit der rechten Hand",
   "Let go with the left hand": "Lass mit der linken Hand los", "Let go with the right hand": "Lass mit der rechten Hand los",
-  "Grasps of the needle": "Griffe an die Nadel", "Contact with rings": "Kontakt mit Ringen", "Peak force on rings": "Größte Kraft auf Ringe",
+  "Bring the needle's tip to the yellow mark, and turn it in": "Führe die Spitze der Nadel zur gelben Marke, und drehe sie hinein",
+  "Turn the needle about its circle, to the yellow mark": "Drehe die Nadel um ihren Kreis, zur gelben Marke", "Turn it on until the tip is out": "Drehe weiter, bis die Spitze heraus ist",
+  "Depth of the bite": "Tiefe des Stichs", "Grasps of the needle": "Griffe an die Nadel", "Contact with rings": "Kontakt mit Ringen", "Peak force on rings": "Größte Kraft auf Ringe",
   "plan how the other hand is to take it before you hand it over": "plane vor dem Übergeben, wie die andere Hand sie nimmt", "turn the needle about its circle in place of pushing it": "drehe die Nadel um ihren Kreis, statt sie zu schieben",
   "Too much force: # N, expected at most # N": "Zu viel Kraft: # N, höchstens # N", "The shaft presses on the organ with # N": "Der Schaft drückt mit # N auf das Organ",
   "You press on what is around with # N": "Du drückst mit # N auf die Umgebung", "The tip is out of the picture": "Die Spitze ist nicht im Bild",
@@ -113,9 +116,10 @@ const GERMAN = {
 };
 const ENGLISH = {
   "touch": "Touch", "probe": "Press and palpate", "trace": "Follow a line", "grasp": "Grasp and lift", "retract": "Hold aside", "tease": "Tease off",
-  "dissect": "Dissect", "cut": "Cut", "bimanual": "With two hands", "navigate": "Hold the camera", "needle": "Hand a needle over", "easy": "Easy", "standard": "Standard", "hard": "Hard", "depth": "Depth",
+  "dissect": "Dissect", "cut": "Cut", "bimanual": "With two hands", "navigate": "Hold the camera", "needle": "Hand a needle over", "suture": "Suture", "easy": "Easy", "standard": "Standard", "hard": "Hard", "depth": "Depth",
   "palpate_easy": "Palpate, easy", "palpate_standard": "Palpate, standard", "palpate_hard": "Palpate, hard",
   "transfer_easy": "Transfer, easy", "transfer_standard": "Transfer, standard", "transfer_hard": "Transfer, hard",
+  "drive_easy": "Drive, easy", "drive_standard": "Drive, standard", "drive_hard": "Drive, hard",
 };
 export const LANGUAGES = {en: ENGLISH, de: GERMAN};
 

@@ -1,0 +1,277 @@
+"""Drive: drive a needle through two marked points of a wall, in and out, with a wristed driver.
+
+A needle of 26 mm, half a circle, begins in the jaws. It is to go in through the first mark, under
+the wall along its own circle, and out through the second one, 12 mm on. The wall dents under the
+tip until it gives way, then the needle slides through its hole, see `palpate.add_organ(needles=)`.
+
+Own observations, in the world: `target` (3,), from the needle's tip to the mark whose turn it is
+[m]; `circle` (3,), axis of the needle's circle [-]; `middle` (3,), from the first mark to the
+middle of that circle [m]; `pierced` (1,), holes that the needle has made in their turn [-]; `out`
+(1,), how far the tip has come out, as a share of what is wanted [-]; `holds` (1,), whether the
+jaws hold the needle.
+
+Progress: 0.3 * closeness of the tip to the first mark; 0.4 + 0.2 * closeness to the second one once
+it is in; 0.7 + 0.3 * out once it is through both. Success: both holes within the tolerance of their
+marks, and the tip out by 5 mm. Failure: a hole farther from its mark, a needle that nobody holds
+for half a second, a force of the needle on the wall above the damage limit, or the time limit.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+import palpate
+from palpate.models import laparoscope, wrist
+
+from ..core.base import Physics, Task
+from ..core.performer import Performer, Script
+from ..core.rules import closeness, pinch
+from ..core.scenes import Scene
+from ..registry import exercise
+from . import sheet
+from .transfer import (
+  HELD,
+  LOST,
+  MEETS,
+  NEAR,
+  PIECES,
+  RADIUS,
+  about,
+  arc,
+  away,
+  carry,
+  grasp,
+  needle,
+)
+
+BITE = 0.012  # between the marks [m]; FLS: 5 mm on either side of a slit
+WANTED = 0.005  # how far the tip is to come out [m]
+# Energy that it takes to open an area of the wall [J/m^2], and friction in it [N/m]; skin takes
+# 2500, liver 75 to 185 (10.1007/978-3-540-70521-5_18).
+TOUGH, FRICTION = 800.0, 15.0
+WALL = {"young": 4e5, "thickness": 0.0015, "tension": 20.0, "damping": 0.005, "foundation": 5e4}
+FIELD = Scene(
+  organ="sheet", instrument="psm", port=(-0.035, 0.1, 0.07), camera=(0.04, 0.06, 0.06), nodes=400
+)
+_MASS, _SLOTS = 0.004, 120  # of the wall [kg], and of its window
+_HELD_AT = math.radians(-65.0)  # along the arc from its middle [rad]
+_OPENING = 0.056  # of each jaw, just off the wire [rad]
+# Of the expert: over the wall [m], the tip's way out at the end [m], and how far it turns at once
+# [rad].
+_OVER, _MORE, _LOOK = 0.012, 0.0015, 0.6
+
+
+@exercise("suture/drive_easy", 20, "easy")
+def easy(**kwargs):
+  """Drive a needle through two marks 12 mm apart, within 3 mm."""
+  return Drive(FIELD, **{"tolerance": 0.003, "turn": 10.0, **kwargs})
+
+
+@exercise("suture/drive_standard", 25)
+def standard(**kwargs):
+  """Drive it within 2 mm, in changing directions."""
+  return Drive(FIELD, **{"tolerance": 0.002, "turn": 25.0, "jitter": 0.003, **kwargs})
+
+
+@exercise("suture/drive_hard", 30, "hard")
+def hard(**kwargs):
+  """Drive it within 1 mm, as FLS asks for, through a tougher wall."""
+  kwargs = {"tolerance": 0.001, "turn": 25.0, "jitter": 0.005, "tough": 1200.0, **kwargs}
+  return Drive(FIELD, **kwargs)
+
+
+class Drive(Task):
+  """Drive a needle through two marks."""
+
+  watch = ("drop", "unintended_contact")
+  targets = 2
+
+  def __init__(
+    self,
+    scene: Scene,
+    random=None,
+    *,
+    tolerance: float,
+    turn: float,
+    tough: float = TOUGH,
+    **kwargs,
+  ):
+    """Makes the task.
+
+    Args:
+      scene: what it plays in
+      random: see Task
+      tolerance: how far holes may be from their marks [m]
+      turn: most that the bite is turned about the vertical [deg]
+      tough: energy that it takes to open an area of the wall [J/m^2]
+      **kwargs: see Task
+    """
+    self.tolerance, self.turn, self.tough = tolerance, math.radians(turn), tough
+    kwargs = {"force_limit": 2.0, "damage": 6.0, **kwargs}
+    super().__init__(dataclasses.replace(scene, targets=2), random, **kwargs)
+
+  def spec(self, variant: int | None) -> mujoco.MjSpec:
+    """Returns the scene: a wall in a frame, and the needle."""
+    law = {"needles": f"needle {self.tough:g} {FRICTION:g}"}
+    spec = sheet.stretched(self._scene(variant), WALL | law, _MASS, slots=_SLOTS)
+    for geom in spec.geoms:
+      if geom.parent.name.startswith(self.prefix) and geom.contype & 1:
+        geom.contype, geom.conaffinity = geom.contype | MEETS, geom.conaffinity | MEETS
+    apart = (0.1, 0.0, -0.05)  # until an episode begins
+    meets = {"contype": 1 | MEETS, "conaffinity": 1 | MEETS}
+    palpate.add_needle(spec, pos=apart, quat=(1, 1, 0, 0), contact=meets)
+    return spec
+
+  def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Returns all of the wall, and its middle."""
+    return np.arange(len(physics.organ.elem)), np.zeros(3)
+
+  def begin(self, physics: Physics) -> None:
+    """Draws the marks and how the jaws hold the needle."""
+    angle = self.random.uniform(-self.turn, self.turn)
+    middle = np.array([*self.random.uniform(-0.005, 0.005, 2), 0.0])
+    self.way = -np.array([math.cos(angle), math.sin(angle), 0.0])
+    self.marks = middle + np.outer([-0.5, 0.5], BITE * self.way)
+    place, mat = posed(self, -self.half - math.radians(20.0))
+    place = place + np.array([0.0, 0.0, _OVER]) + self.random.uniform(-0.003, 0.003, 3)
+    lean = self.random.uniform(-0.15, 0.15, 3)
+    mat = about(0, lean[0]) @ about(1, lean[1]) @ about(2, lean[2]) @ mat
+    self.joints = {"needle": np.concatenate([place, laparoscope.orientation(mat)])}
+    held = _HELD_AT + self.random.uniform(-0.1, 0.1)
+    port = physics.trocar()
+    physics.set_joints(wrist.inverse(port, *grasp(port, place, mat, held)))
+    self.joints |= {f"{self.prefix}jaw_{side}": np.array([_OPENING]) for side in ("left", "right")}
+    self.holes, self.misses, self.loose, self.holds = 0, [0.0, 0.0], 0.0, 1.0
+    self.out = self.deepest = self.pull = 0.0
+    self.start0 = float(np.linalg.norm(place + RADIUS * mat[:, 1] - self.marks[0]))
+
+  @property
+  def half(self) -> float:
+    """Half of the angle that the bite has on the needle's circle [rad]."""
+    return math.asin(0.5 * BITE / RADIUS)
+
+  def advance(self, physics: Physics) -> float:
+    """Follows the needle through the wall."""
+    held = pinch(physics) > HELD and away(physics, physics.tip_pos()) < NEAR
+    if self.holds and not held:
+      self.event(physics, "drop", label="needle")
+    self.holds, self.loose = float(held), 0.0 if held else self.loose + self.control_timestep
+    (found,) = physics.organ.needles
+    self.pull = float(np.linalg.norm(found.force))
+    for k, hole in enumerate(found.holes[:2]):
+      if k == self.holes:
+        self.misses[k] = float(np.linalg.norm((hole.rest - self.marks[k])[:2]))
+        self.event(physics, "target", self.misses[k], "hole")
+    self.holes = min(len(found.holes), 2)
+    tip = arc(physics, 1.0)
+    if self.holes:
+      low = min(float(arc(physics, k / PIECES)[2]) for k in range(PIECES + 1))
+      self.deepest = max(self.deepest, -low)
+    self.out = 0.0
+    if self.holes == 2:
+      self.out = min(max((RADIUS * math.pi - found.holes[1].along) / WANTED, 0.0), 1.0)
+    self.show(physics)
+    if any(error > self.tolerance for error in self.misses[: self.holes]) or self.loose > LOST:
+      self.outcome = "missed"
+    if self.pull > self.damage:
+      self.outcome = "damage"
+      self.event(physics, "note", label=f"torn by a pull of {self.pull:.2f} N")
+      return -1.0
+    far = float(np.linalg.norm(tip - self.marks[min(self.holes, 1)]))
+    if self.holes == 0:
+      return 0.3 * closeness(far, self.start0)
+    if self.holes == 1:
+      return 0.4 + 0.2 * closeness(far, BITE)
+    if self.out >= 1.0 and self.outcome is None:
+      self.outcome = "success"
+      return 1.0
+    return 0.7 + 0.3 * self.out
+
+  def show(self, physics: Physics) -> None:
+    """Draws the marks that are left, the next one in yellow."""
+    for k, mark in enumerate(self.marks):
+      physics.mark(k, mark + np.array([0.0, 0.0, 0.0008]), k >= self.holes, k == self.holes, 0.0008)
+
+  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
+    """Finds where the needle is."""
+    pos, mat = needle(physics)
+    return {
+      "target": self.marks[min(self.holes, 1)] - arc(physics, 1.0),
+      "circle": mat[:, 2],
+      "middle": pos - self.marks[0],
+      "pierced": np.array([float(self.holes)]),
+      "out": np.array([self.out]),
+      "holds": np.array([self.holds]),
+    }
+
+  def still(self, hand: int) -> np.ndarray:
+    """Returns what keeps the jaws closed on the needle."""
+    return np.array([-1.0 if self.holds else 0.15])
+
+  def recorded(self, physics: Physics) -> dict[str, float]:
+    """Returns the needle's pull on the wall, and how deep it went."""
+    return {"traction": self.pull, "bite": self.deepest}
+
+  def settings(self) -> Any:
+    """Returns the limits of the metrics: none of the grip, which is a needle's."""
+    return dataclasses.replace(super().settings(), grip_limit=None)
+
+  def instruct(self, physics: Physics) -> str:
+    """Says what is next."""
+    return (
+      "Bring the needle's tip to the yellow mark, and turn it in",
+      "Turn the needle about its circle, to the yellow mark",
+      "Turn it on until the tip is out",
+    )[self.holes]
+
+  def expert(self, p: Performer) -> Script:
+    """Puts the needle over the first mark, and turns it about its circle through both."""
+    start = -self.half - math.radians(12.0)
+    end = self.half + (WANTED + _MORE) / RADIUS
+    if not self.holes:
+      over = posed(self, start)
+      yield from carry(p, lambda t: (over[0] + np.array([0.0, 0.0, 0.006]), over[1]))
+      yield from _arrive(p)
+      yield from carry(p, lambda t: over)
+    while True:  # looking again how the needle lies in the jaws
+      yield from _arrive(p)
+      now = tip_angle(self, p.physics)
+      if now > end - 0.01:
+        return
+      stop = min(now + _LOOK, end)
+      yield from carry(p, functools.partial(_turned, self, now, stop), stop - now)
+
+
+def _turned(task: Drive, start: float, stop: float, t: float) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the pose of a needle that is a share of the way between two angles of its tip."""
+  return posed(task, start + t * (stop - start))
+
+
+def _arrive(p: Performer) -> Script:
+  """Waits for a hand that is late."""
+  if p.style.reaction:
+    yield from p.wait(p.style.reaction + 0.1)
+
+
+def posed(task: Drive, tip: float) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the needle's pose with its circle through both marks, by the angle of its tip.
+
+  The angle is that at the middle of the circle, from straight down towards the second mark [rad].
+  """
+  up = np.array([0.0, 0.0, 1.0])
+  axis = np.cross(task.way, up)  # about which it turns: down goes to `way`
+  middle = task.marks.mean(axis=0) + RADIUS * math.cos(task.half) * up
+  # The tip is a quarter turn ahead of the middle of the arc.
+  angle = tip - math.pi / 2
+  x = -math.cos(angle) * up + math.sin(angle) * task.way
+  return middle, np.column_stack([x, np.cross(axis, x), axis])
+
+
+def tip_angle(task: Drive, physics: Any) -> float:
+  """Returns the angle of the needle's tip, see `posed`."""
+  pos, _ = needle(physics)
+  tip = arc(physics, 1.0) - pos
+  return math.atan2(float(tip @ task.way), -float(tip[2]))
