@@ -109,9 +109,9 @@ def test_every_notebook_is_listed_and_tested():
 def test_ppo_learns_from_nothing_in_a_few_worlds_on_the_cpu(tmp_path):
   pytest.importorskip("torch")
   curve = tmp_path / "ppo.csv"
-  options = ["--device", "warp-cpu", "--worlds", "4", "--steps", "8", "--minutes", "0.1"]
+  options = ["--device", "warp-cpu", "--worlds", "4", "--steps", "4", "--minutes", "0.1"]
   command = [sys.executable, str(FOLDER / "ppo.py"), "touch/easy", *options, "--out", str(curve)]
   subprocess.run(command, check=True, timeout=600)
   rows = list(csv.DictReader(curve.open()))
-  assert len(rows) >= 2 and int(rows[-1]["steps"]) == 32 * len(rows)
-  assert all(float(row["spread"]) > 0 for row in rows)
+  assert len(rows) >= 2 and int(rows[-1]["steps"]) == 16 * len(rows)
+  assert all(float(row["spread"]) > 0 and float(row["made"]) > 0 for row in rows)

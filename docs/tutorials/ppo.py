@@ -64,7 +64,7 @@ class Agent(nn.Module):
 
   def normal(self, seen: torch.Tensor) -> torch.Tensor:
     """Returns observations around 0, of size 1."""
-    return ((seen - self.centre) / (self.square + 1e-8).sqrt()).clamp(-5, 5)
+    return ((seen - self.centre) / (self.square + 1e-6).sqrt()).clamp(-5, 5)
 
   def policy(self, normal: torch.Tensor) -> torch.distributions.Normal:
     """Returns how the actions are spread."""
@@ -153,18 +153,23 @@ def main() -> None:
   add("--out", default="ppo.csv", help="curve (%(default)s)")
   args = parser.parse_args()
   torch.manual_seed(args.seed)
+  start = time.time()
   worlds = Worlds(args.task, args.worlds, args.device)
+  for _ in range(2):  # kernels are compiled in the first step, and recorded in the second
+    seen = worlds.reset(seed=args.seed)
+    worlds.step(torch.zeros(args.worlds, worlds.naction, device=seen.device))
   seen = worlds.reset(seed=args.seed)
   agent = Agent(seen.shape[1], worlds.naction).to(seen.device)
   adam = torch.optim.Adam(agent.parameters(), lr=1e-3)
   won, earned, best, idle = (torch.zeros(args.worlds, device=seen.device) for _ in range(4))
   patience = torch.randint(*PATIENCE, (args.worlds,), device=seen.device)
-  start, done, steps, iteration, judged = time.time(), False, 0, 0, math.nan
+  made, start = time.time() - start, time.time()
+  done, steps, iteration, due, judged = False, 0, 0, 0, math.nan
   agent.look(seen)
   with open(args.out, "w", newline="") as file:
     write = csv.writer(file)
     names = ("success", "judged", "progress", "most", "paid", "spread")
-    write.writerow(("task", "seed", "steps", "seconds", *names))
+    write.writerow(("task", "seed", "made", "steps", "seconds", *names))
     while not done:
       rows: list[tuple[torch.Tensor, ...]] = []
       for _ in range(args.steps):
@@ -198,8 +203,9 @@ def main() -> None:
       iteration, steps = iteration + 1, steps + over.numel()
       seconds, success = time.time() - start, float(won.mean())
       stuck = idle > patience
-      if success >= args.enough and iteration % 10 == 0:
+      if success >= args.enough and iteration >= due:
         judged, stuck = judge(agent, worlds, args.enough), torch.ones_like(stuck)
+        due, seconds = iteration + 30, time.time() - start
       if stuck.any():
         seen = worlds.reset(options={"reset_mask": stuck.cpu().numpy()})
         earned, best, idle, won = (x * ~stuck for x in (earned, best, idle, won))
@@ -207,7 +213,8 @@ def main() -> None:
       progress = info["progress"]
       row = (success, judged, float(progress.mean()), float(progress.max()),
              float(reward.sum(0).mean()), float(agent.spread.detach().exp().mean()))  # fmt: skip
-      write.writerow((args.task, args.seed, steps, round(seconds, 1), *(f"{x:.4g}" for x in row)))
+      now = round(made, 1), steps, round(seconds, 1)
+      write.writerow((args.task, args.seed, *now, *(f"{x:.4g}" for x in row)))
       file.flush()
       if iteration % 10 == 0 or done:
         shown = ", ".join(f"{name} {x:.2f}" for name, x in zip(names, row, strict=True))

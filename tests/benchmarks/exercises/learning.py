@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 import pathlib
 import subprocess
 import sys
@@ -63,7 +64,8 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   apart = max(1, len(found) // POINTS)
   return [
     {key: case[key] for key in ("task", "seed", "worlds")}
-    | {"steps": int(row["steps"]), "seconds": float(row["seconds"])}
+    | {"steps": int(row["steps"])}
+    | {key: float(row[key]) for key in ("made", "seconds")}
     | {key: round(100 * float(row[key]), 1) for key in ("success", "judged")}
     | {"palpate": palpate.__version__}
     for row in (*found[:-1:apart], found[-1])
@@ -91,6 +93,11 @@ def finding(rows: list[Row]) -> list[str]:
   return lines
 
 
+def shown(value: float, unit: str = "") -> str:
+  """Returns a whole number for a table, "-" where it is unknown."""
+  return "-" if math.isnan(value) else f"{value:.0f}{unit}"
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Draws success over control steps, and writes the page."""
   found = trainings(rows)
@@ -103,16 +110,18 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   title = "What is learned from nothing"
   picture = plots.save(figure, out / "learning.png", title)
   table = [
-    [task, end["seed"], f"{end['steps'] / 1e6:.2f}", f"{end['seconds']:.0f}",
-     f"{end['judged']:.0f} %" if end["judged"] == end["judged"] else "-", f"{end['success']:.0f} %"]
+    [task, end["seed"], shown(end["made"]), f"{end['steps'] / 1e6:.2f}", f"{end['seconds']:.0f}",
+     shown(end["judged"], " %"), f"{end['success']:.0f} %"]
     for task, curves in found.items()
     for end in (curve[-1] for curve in curves)
   ]  # fmt: skip
-  head = ["exercise", "seed", "million control steps", "seconds", "success", "with noise"]
+  head = ["exercise", "seed", "start [s]", "million control steps", "learning [s]", "success",
+          "with noise"]  # fmt: skip
   lines = [
     *(__doc__ or "").split("\n\n", 1)[1].splitlines(),
     "`success` is without noise, of an episode in each world, and at least that: counting ends at "
-    f"{ENOUGH:.0f} %. `with noise` is of the last episodes of the training. "
+    f"{ENOUGH:.0f} %. `with noise` is of the last episodes of the training. `start` is what comes "
+    "before learning: kernels are compiled the first time an exercise runs, and loaded after that. "
     + results.link(out / "learning.csv"),
     "",
     *plots.table(head, table),
