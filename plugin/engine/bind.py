@@ -95,7 +95,7 @@ def _scatter(w: Workspace, does: Phases):
   does.scatter()
   w.forces.act()
   if w.needles:
-    contacts.lift.launch("cpu", 1, 1, 0, w.views["weights"])
+    w.host.open_contacts()
 
 
 def _advance(w: Workspace, does: Phases, ends: bool):
@@ -145,7 +145,7 @@ def _touched(w: Workspace, model: int) -> contacts.Weights:
   flexes = declare_windows.touching(model, w.seen.instance)
   out = contacts.make(model, w.data, flexes, w.report.flags)
   out.mine.numpy()[w.organ.flexes] = 2
-  w.views |= {"mine": out.mine, "weights": out}
+  w.views["mine"], w.host.weights = out.mine, out
   return out
 
 

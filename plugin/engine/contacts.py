@@ -79,8 +79,9 @@ class Weights:
   mine: ints("nflex")  # 1 where a flex is an organ's, or a window of one; 2 where of the own one
   flags: ints(len(FLAG))  # see FLAG
   tissue: doubles("nflex", len(TISSUE))  # see TISSUE
+  nflex: int
   ngeom: int  # geoms of the model
-  lifted: ints("nflexgeom")  # whether a geom does not touch a flex, see `lifted`
+  lifted: ints("nlifted")  # see `lifted`
   force_adr: ints("nflexvert")  # where the plugin state has a vertex' contact force, or -1
   # mjOption:
   jacobian: ints(1)
@@ -192,6 +193,7 @@ def make(model: int, data: int, flexes, flags: np.ndarray | memoryview | None = 
   out.tissue = wp.array(tissue, dtype=wp.float64, device="cpu", copy=False)
   out.force_adr = wp.array(adr, dtype=int, device="cpu", copy=False)
   out.ngeom = mjstruct.Model.from_address(model).ngeom
+  out.nflex = mjstruct.Model.from_address(model).nflex
   out.lifted = wp.array(lifted(model, data).ravel(), dtype=int, device="cpu", copy=False)
   out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
   out.mine = wp.array(mine, dtype=int, device="cpu")
@@ -201,10 +203,13 @@ def make(model: int, data: int, flexes, flags: np.ndarray | memoryview | None = 
 
 
 def lifted(model: int, data: int) -> np.ndarray:
-  """Returns whether a flex and a geom do not touch in an mjData, as needles say, (nflex, ngeom)."""
+  """Returns what does not touch each flex in an mjData, as needles say, (nflex, ngeom + 2 nflex).
+
+  Geoms are 0 or 1, and of each flex that is a thread come the first edge and that after the last.
+  """
   m = mjstruct.Model.from_address(model)
-  if data not in _lifted or _lifted[data].shape != (m.nflex, m.ngeom):
-    _lifted[data] = np.zeros((m.nflex, m.ngeom), np.int32)
+  if data not in _lifted or _lifted[data].shape != (m.nflex, m.ngeom + 2 * m.nflex):
+    _lifted[data] = np.zeros((m.nflex, m.ngeom + 2 * m.nflex), np.int32)
   return _lifted[data]
 
 

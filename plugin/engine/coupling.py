@@ -29,6 +29,7 @@ from .model import mjstruct
 if TYPE_CHECKING:
   from .model.declare import Declaration
 
+MOST_TIES = 64  # of a thread
 _HUGE = 1e6  # more than any displacement, velocity or force of an organ [m, m/s, N]
 
 
@@ -182,6 +183,7 @@ class Crossing:
 
 
 CONSTANTS = {
+  "MOST_TIES": MOST_TIES,
   "DISABLE_GRAVITY": int(mujoco.mjtDisableBit.mjDSBL_GRAVITY),
   **{f"GEOM_IS_{name}": int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in (
     "PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER"
@@ -216,6 +218,46 @@ def mujoco_arrays(model: int, data: int, kind: Any = Mujoco):
     shape = [getattr(m, n) if isinstance(n, str) else n for n in dims]
     setattr(out, name, wrap(address, shape, kind.vars[name].type.dtype))
   return out
+
+
+class Ties:
+  """What holds a thread in one mjData: arrays of `Rod`, filled anew as its step begins.
+
+  Attributes:
+    arrays: those, by name
+    aims: launches that add to them, by who does
+    lead: lets the thread take its step before an organ's, given that's instance
+    led: whether it has
+  """
+
+  def __init__(self):
+    kinds: dict[str, tuple[Any, Any]] = {"tie_count": (1, int), "tie_edge": (MOST_TIES, int)}
+    kinds["tie_value"] = (MOST_TIES, 13), wp.float64
+    self.arrays = {n: wp.zeros(s, dtype=kind, device="cpu") for n, (s, kind) in kinds.items()}
+    self.aims: dict[Any, Callable[[], None]] = {}
+    self.lead: Callable[[int], None] = lambda instance: None
+    self.led = False
+
+  def aim(self):
+    """Fills the arrays."""
+    if self.aims:
+      self.arrays["tie_count"].zero_()
+      for each in self.aims.values():
+        each()
+
+
+_ties: dict[tuple[int, int], Ties] = {}
+
+
+def ties(data: int, flex: int) -> Ties:
+  """Returns what holds the thread of a flex in an mjData."""
+  return _ties.setdefault((data, flex), Ties())
+
+
+def forget(data: int):
+  """Forgets what holds threads in an mjData that is freed."""
+  for key in [key for key in _ties if key[0] == data]:
+    del _ties[key]
 
 
 def on_body(body: Body) -> dict[str, wp.array]:

@@ -35,9 +35,11 @@ class Host(host.Host):
       that a node in contact may have (1,)
     state: its numbers in mjData.plugin_state
     own: their blocks
+    weights: what contacts with it get weights by
   """
 
   alone, nworld = True, 1
+  weights: Any = None
 
   def __init__(self, organ: Declaration, body: Body, data: int, model: int, instance: int):
     self.organ, self.config, self.body = organ, organ.config, body
@@ -118,6 +120,10 @@ class Host(host.Host):
         self._surface[name] = wp.array(values, dtype=kinds[name], device="cpu")
         self._there[name] = self._surface[name].numpy()
     return self._surface
+
+  def open_contacts(self):
+    """Opens the contacts that forces say are none, see `lifted`."""
+    contacts.lift.launch("cpu", 1, 1, 0, self.weights)
 
   def lifted(self) -> wp.array:
     """See `Host`."""

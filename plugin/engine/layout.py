@@ -183,6 +183,7 @@ HOLE = Numbers(
   ("elem", 1, "-", "its triangle, or inside its tetrahedron"),
   ("share", 3, "-", "of the corners but the first"),
   ("slip", 1, "m", "place on the needle at which friction is at rest"),
+  ("thread", 1, "m", "place on the thread, from the needle on; 0 while the needle is in it"),
 )
 
 # Of the plugin state: a needle, see `forces/needles.h`.
@@ -204,9 +205,11 @@ PIERCE = Numbers(
   ("surface", 1, "N", "that the surface of a solid bears"),
   ("friction", 1, "N/m", "by length in tissue"),
   ("stiffness", 1, "N/m", "of what ties it to a hole"),
+  ("capstan", 1, "-", "friction of its thread around the edge of a hole"),
   ("wall", 1, "m", "thickness of a sheet, 0 of a solid"),
   ("clear", 1, "m", "how far a tip is off its seat before it may skid"),
   ("margin", 1, "m", "before its first hole, from where on it has no contacts"),
+  ("close", 1, "m", "from a hole, to where its thread has none"),
 )
 
 # The last numbers of the plugin state of a windowed organ.

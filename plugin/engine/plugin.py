@@ -17,7 +17,7 @@ import numpy as np
 from palpate.tissue.config import KEYS
 
 from ..forces.passive import Force
-from . import change, contacts, rods, signals, workspace
+from . import change, contacts, coupling, rods, signals, workspace
 from .cutting import cuts
 from .layout import FLAG
 from .model import declare, mjstruct, skin, state_size
@@ -141,6 +141,7 @@ def _init(model: int, data: int, instance: int) -> int:
 def _destroy(data: int, instance: int):
   w = _workspaces.pop((data, instance), None)
   contacts.forget(data)
+  coupling.forget(data)
   for state in [s for s, other in _states.items() if other is w]:
     del _states[state]
 

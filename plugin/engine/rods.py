@@ -95,6 +95,9 @@ class Rod:
   row_kind: ints("nrow")  # see `RowKind`
   row_node: ints("nrow")  # the first of the two nodes
   row_value: doubles("nrow", 9)  # J of their dofs; J a of other bodies less aref; D; friction
+  tie_count: ints(1)  # what holds it, see `coupling.Ties`
+  tie_edge: ints("ntie")  # the edge that is held
+  tie_value: doubles("ntie", 13)  # see `rod_ties.h`
   own: RodState
 
 
@@ -255,6 +258,9 @@ def scratch(n: int) -> dict[str, np.ndarray]:
     row_kind=np.zeros(rows),
     row_node=np.zeros(rows),
     row_value=np.zeros((rows, 9)),
+    tie_count=np.zeros(1),
+    tie_edge=np.zeros(coupling.MOST_TIES),
+    tie_value=np.zeros((coupling.MOST_TIES, 13)),
   )
 
 
@@ -295,6 +301,7 @@ class Workspace:
     mass: of its nodes [kg]  (nvert,)
     friction: on itself
     own: its numbers in mjData.plugin_state
+    ties: what organs hold it by
     seen, report: as of an organ
   """
 
@@ -319,7 +326,10 @@ class Workspace:
     self.constants = rod.constants(organ.rest, organ.radius, organ.config, mass, organ.clamped)
     self.own = layout.carve(RodState, self.state, sizes)
     values = self.constants | settings(organ, self.friction) | scratch(n)
-    own = fill(Rod, "cpu", values | {"mass": mass, "own": self.own})
+    self.ties = coupling.ties(self.data, organ.flex)
+    self.ties.lead = self._lead
+    values |= {"mass": mass, "own": self.own} | self.ties.arrays
+    own = fill(Rod, "cpu", values)
     values = dict(
       rod=own,
       flex=organ.flex,
@@ -360,6 +370,10 @@ class Workspace:
           "plugin_state is not one of this thread, but saved from another model or damaged; reset "
           "the data, or set a state that was saved from it"
         )
+    if self.ties.led:
+      self.ties.led = False
+      return
+    self.ties.aim()
     self._begin.launch()
     self.report.computed = True
     if self._status[0] < 0:
@@ -369,6 +383,12 @@ class Workspace:
         f"a step was not solved in {self.organ.config.iterations} iterations: its forces are out "
         "of balance; a smaller time step or more of the key iterations may help"
       )
+
+  def _lead(self, instance: int):
+    """Takes the step before that of an organ that holds it, where it does not anyway."""
+    if self.instance > instance and not self.ties.led:
+      self.run()
+      self.ties.led = True
 
   def step(self):
     """Ends the step after MuJoCo has moved."""

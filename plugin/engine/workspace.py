@@ -264,6 +264,7 @@ class Workspace:
       self._run()
 
   def _run(self):
+    self.needles.lead()
     if self.turn is not None:
       # The model's windows may not be those of this state, which was set from outside or shares the
       # model with another: contacts must be found again with the windows in place.

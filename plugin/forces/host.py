@@ -212,7 +212,7 @@ class Host(abc.ABC):
 
   @abc.abstractmethod
   def lifted(self) -> wp.array:
-    """Returns where forces say whether a geom does not touch the organ, (nworld, ngeom)."""
+    """Returns where forces say what does not touch the organ, see `contacts.lifted`, by world."""
 
   @abc.abstractmethod
   def tools(self, name: str) -> np.ndarray:

@@ -12,12 +12,13 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from palpate.tissue import config as configuration
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import doubles, ints, struct
 
-from ..engine import contacts
+from ..engine import contacts, coupling
 from ..engine.layout import HOLE, HOLES, NEEDLE, PIERCE
-from ..engine.model import flexes, mjstruct
+from ..engine.model import declare, flexes, mjstruct
 from .declare_attachments import find_body, most
 from .host import Bodies, Host, Input, Nodes, kernels
 from .passive import Force
@@ -27,6 +28,7 @@ _FIRM = 10.0
 # How much farther than they reach contacts with a needle end before a hole, and the least, in a
 # needle's lengths: that of its point.
 _MARGIN, _POINT = 3.0, 0.1
+_BESIDE = 1.4  # the same of a thread beside a hole, to before where contacts begin
 _ENDS = ("swage", "tip")
 # As in the header.
 _POINTS = HOLES + 1
@@ -53,7 +55,13 @@ class Pierced:
   geom: ints("nlisted")  # geoms of needles
   whose: ints("nlisted")  # of which
   end: doubles("nlisted")  # where along it they end [m]
-  lifted: ints("nworld", "ngeom")  # whether a geom does not touch the organ
+  strand: ints("nneedle", 2)  # first of the nodes below that are its thread's, and how many
+  strand_flex: ints("nneedle")  # the thread's flex
+  node: ints("nnode")  # body of a thread's node, from the swage on
+  local: doubles("nnode", 3)  # place of the node there [m]
+  edges: doubles("nnode", 2)  # length at rest [m] and stiffness [N/m] of the edge to the next
+  ngeom: int  # geoms of the model
+  lifted: ints("nworld", "nlift")  # what does not touch the organ, see `contacts.lifted`
   mesh: ints("nworld")  # which mesh a world has
   elem: ints("nmesh", "nelem", 3)  # triangles
   tet: ints("nmesh", "ntet", 4)  # tetrahedra
@@ -65,15 +73,31 @@ class Pierced:
   held: ints("nworld", "nneedle", _POINTS, 4)  # vertices that bear it
   share: doubles("nworld", "nneedle", _POINTS, 4)  # of each of them
   hold: doubles("nworld", "nneedle", _POINTS, 6)  # what weighs on the change of velocity there [kg]
+  feels: ints("nworld", "nneedle", _POINTS)  # whether the needle feels the force
+  pull: doubles("nworld", "nneedle", _POINTS, 3)  # of a thread, in the organ's frame [N]
   weight: doubles("nworld", "nneedle")  # what all of them weigh on the needle [kg]
   own: Nodes
   solve: Input
   mj: Bodies
 
 
+@struct
+class Held:
+  """Needles, and what holds the thread of one."""
+
+  pierced: Pierced
+  frame: doubles(3, 3)  # rotation from the axes of the thread's slides to the world
+  origin: doubles(3)  # position of its frame [m]
+  first: ints(1)  # the first of these
+  tie_count: ints(1)  # see `coupling.Ties`
+  tie_edge: ints("ntie")
+  tie_value: doubles("ntie", 13)
+
+
 _enter, _act, _keep = kernels(
   "forces/needles.h", Pierced, "enter_needles", "act_needles", "keep_needles"
 )
+_aim, _feel = kernels("forces/needles.h", Held, "aim_thread", "feel_thread")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,14 +107,16 @@ class Pinhole:
   Attributes:
     needle: name of its body
     inside: whether it is a point inside of a solid
+    thread: whether it is the needle's thread that is in it
     at: place now, in the world [m]                         (3,)
     rest: the same at rest                                  (3,)
-    along: how far along the needle it is, from the swage [m]
+    along: how far along the needle it is, from the swage; on the thread negative [m]
     force: on the organ in the last step, in the world [N]  (3,)
   """
 
   needle: str
   inside: bool
+  thread: bool
   at: np.ndarray
   rest: np.ndarray
   along: float
@@ -135,6 +161,8 @@ class Needles(Force):
     self.count = 1  # a warp a world
     self.names: list[str] = []
     self._shape: dict[str, np.ndarray] = {}
+    self._threads: list[dict] = []  # see `_strand`
+    self._held: dict[int, Any] = {}  # `Held` of the needles that have one
     self._slit = np.zeros(0)  # width of what a tip opens [m]
     self._margin = np.zeros(0)  # see `PIERCE.margin` [m]
 
@@ -152,7 +180,7 @@ class Needles(Force):
     found = [_read(host, row.name) for row in rows]
     if not found:
       return
-    radius = float(mjstruct.view(m.flex_radius, m.nflex)[host.organ.flexes[-1]])
+    radius = _radius(host)
     parts = [part for each in found for part in each["parts"]]
     body = np.array([each["body"] for each in found])
     whose = np.repeat(np.arange(len(found)), [len(each["parts"]) for each in found])
@@ -165,6 +193,13 @@ class Needles(Force):
       "whose": whose,
       "end": np.array([end for _, end in parts]),
     }
+    strands = [each["strand"] for each in found]
+    count = np.array([len(each["node"]) for each in strands])
+    self._shape |= {"strand": np.stack([np.cumsum(count) - count, count], axis=1)}
+    self._shape |= {"strand_flex": np.array([each["flex"] for each in strands])}
+    for name in ("node", "local", "edges"):
+      self._shape[name] = np.concatenate([each[name] for each in strands])
+    self._threads = strands
     self._slit = np.array([each["slit"] for each in found])
     thick = np.array([each["radius"] for each in found])
     length = 2 * self._shape["half"] * self._shape["circle"]
@@ -176,6 +211,7 @@ class Needles(Force):
     """See `Force`."""
     if declared:
       self.names, self._shape = declared.names, dict(declared._shape)
+      self._threads = declared._threads
       self._slit, self._margin = declared._slit, declared._margin
       numbers = [self.host.body_number(int(b)) for b in self._shape["body"]]
       self._shape["body"] = np.array(numbers)
@@ -194,9 +230,11 @@ class Needles(Force):
       out[k, PIERCE.surface] = row.surface * self._slit[k]
       out[k, PIERCE.friction] = row.friction
       out[k, PIERCE.stiffness] = min(_FIRM * stiffness, np.inf if free else most(host, bodies[k]))
+      out[k, PIERCE.capstan] = self._threads[k]["friction"]
       out[k, PIERCE.wall] = 0.0 if config.elements == "solid" else config.thickness
       out[k, PIERCE.clear] = self._slit[k]
       out[k, PIERCE.margin] = self._margin[k]
+      out[k, PIERCE.close] = self._threads[k]["close"]
     return out
 
   @property
@@ -209,20 +247,46 @@ class Needles(Force):
     if not self:
       return
     host, n = self.host, len(self.names)
-    widths = {"force": 3, "point": 3, "share": 4, "hold": 6}
+    widths = {"force": 3, "point": 3, "pull": 3, "share": 4, "hold": 6}
     values: dict[str, Any] = {name: host.zeros(n, _POINTS, w) for name, w in widths.items()}
     values |= self._shape | host.surface() | dict(
       nneedle=n,
       nlisted=len(self._shape["geom"]),
+      ngeom=host.m.ngeom,
       edge=float(host.organ.mesh.whole.edge_length),
       law=np.tile(self._law(), (host.nworld, 1, 1)),
       lifted=host.lifted(),
       state=host.rows("needle", len(NEEDLE)),
       next=host.zeros(n, len(NEEDLE)),
       held=host.zeros(n, _POINTS, 4, dtype=int),
+      feels=host.zeros(n, _POINTS, dtype=int),
       weight=host.zeros(n),
     )  # fmt: skip
     self.fields = host.fill(Pierced, values, into=self.fields)
+    for k, thread in enumerate(self._threads if host.alone else ()):
+      if thread["flex"] >= 0:
+        self._hold(k, thread)
+
+  def _hold(self, k: int, thread: dict):
+    """Lets the step of a thread know what holds it."""
+    host = self.host
+    ties = coupling.ties(host.data, thread["flex"])
+    frame = {"frame": thread["frame"], "origin": thread["origin"]}
+    held = host.fill(Held, {"pierced": self.fields, "first": np.zeros(1)} | frame | ties.arrays)
+    self._held[k] = held
+    host.load(_aim)
+
+    def aim():
+      host.launch(_aim, held, arg=k)
+      host.open_contacts()
+
+    ties.aims[host.instance, k] = aim
+
+  def lead(self):
+    """Lets threads take their steps first, of one world: the tissue bears what holds them then."""
+    for k, held in self._held.items():
+      coupling.ties(self.host.data, self._threads[k]["flex"]).lead(self.host.instance)
+      self.host.launch(_feel, held, arg=k)
 
   def refresh(self):
     """Takes the material that there is now."""
@@ -244,9 +308,10 @@ class Needles(Force):
         hole = row[NEEDLE.hole + len(HOLE) * h :]
         vert, share = _corners(mesh, hole)
         at = share @ x[vert]
-        along = self._along(k, at)
-        within = bool(hole[HOLE.kind] == _WITHIN)
-        holes.append(Pinhole(name, within, at, share @ rest[vert], along, force[k, h]))
+        within, thread = bool(hole[HOLE.kind] == _WITHIN), float(hole[HOLE.thread])
+        along = -thread if thread > 0 else self._along(k, at)
+        place = at, share @ rest[vert], along
+        holes.append(Pinhole(name, within, thread > 0, *place, force[k, h]))
       stage, energy = row[[NEEDLE.stage, NEEDLE.work]]
       whole, tip = force[k].sum(axis=0), force[k, HOLES]
       told = stage == _TOUCHING, stage == _INSIDE, whole, tip, float(energy), tuple(holes)
@@ -307,9 +372,65 @@ def _read(host: Host, name: str) -> dict[str, Any]:
     raise ValueError(f"organ {organ.name!r}: needle {name!r} begins in it, expected one outside")
   return {
     "body": body, "circle": circle, "half": half, "radius": float(size[:, 0].max()),
+    "strand": _strand(host, body),
     "slit": 2 * float(mjstruct.view(m.site_size, (m.nsite, 3))[ends[1], 0]),
     "parts": list(zip(geoms.tolist(), (place + size[:, 1]).tolist(), strict=True)),
   }  # fmt: skip
+
+
+def _strand(host: Host, needle: int) -> dict[str, Any]:
+  """Returns the thread whose first node an equality joins to a needle, if there is one.
+
+  Returns:
+    flex, or -1; body of each node (n,) and its place there [m] (n, 3); rest length and stiffness of
+    the edge to the next node (n, 2); frame (3, 3) and origin (3,) of its slides;
+    friction; how far from a hole it touches nothing
+  """
+  m, none = host.m, np.zeros((0, 3))
+  out = {"flex": -1, "node": none[:, 0], "local": none, "edges": none[:, :2], "friction": 0.0,
+         "close": 0.0}  # fmt: skip
+  first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
+  joined = {
+    int(pair[1 - side])
+    for pair, kind in zip(_pairs(m), mjstruct.view(m.eq_type, m.neq, np.int32), strict=True)
+    for side in range(2)
+    if pair[side] == needle and kind == int(mujoco.mjtEq.mjEQ_CONNECT)
+  }
+  for flex in np.flatnonzero(mjstruct.view(m.flex_dim, m.nflex, np.int32) == 1).tolist():
+    if int(body[first[flex]]) not in joined:
+      continue
+    mine = slice(int(first[flex]), int(first[flex]) + flexes.vertices(m, flex))
+    instance = int(mjstruct.view(m.body_plugin, m.nbody, np.int32)[body[mine][0]])
+    texts = declare.keys(host.model, instance)
+    where = declare.places(m, instance, flex, flexes.name(m, flex))
+    rest, frame, origin = where[1], where[3], where[4]
+    length = np.linalg.norm(np.diff(rest, axis=0), axis=1)
+    young = configuration.parse(flexes.name(m, flex), texts, len(length), closed=False).young
+    thick = float(mjstruct.view(m.flex_radius, m.nflex)[flex])
+    section = np.pi * thick**2
+    edges = np.stack([length, np.asarray(young) * section / length], axis=1)
+    out = {
+      "flex": flex,
+      "node": body[mine].copy(),
+      "local": mjstruct.view(m.flex_vert, (m.nflexvert, 3))[mine].copy(),
+      "edges": np.concatenate([edges, edges[-1:]]),
+      "frame": frame,
+      "origin": origin,
+      "close": _BESIDE * (_radius(host) + thick),
+      "friction": float(mjstruct.view(m.flex_friction, (m.nflex, 3))[flex, 0]),
+    }
+  return out
+
+
+def _radius(host: Host) -> float:
+  return float(mjstruct.view(host.m.flex_radius, host.m.nflex)[host.organ.flexes[-1]])
+
+
+def _pairs(m) -> np.ndarray:
+  """Returns the two objects of each equality, (neq, 2)."""
+  ids = [mjstruct.view(array, m.neq, np.int32) for array in (m.eq_obj1id, m.eq_obj2id)]
+  return np.stack(ids, axis=1)
 
 
 def _goes_through(line: np.ndarray, mesh: Mesh) -> bool:
@@ -320,7 +441,7 @@ def _goes_through(line: np.ndarray, mesh: Mesh) -> bool:
     way, r = stop - start, start - x[:, 0]
     p, q = np.cross(way, g), np.cross(r, e)
     det = (e * p).sum(axis=1)
-    det = np.where(np.abs(det) > 0, det, np.inf)
+    det = np.where(np.abs(det) > 0, det, np.nan)
     v, w, t = (r * p).sum(axis=1) / det, (q @ way) / det, (g * q).sum(axis=1) / det
     if ((v >= 0) & (w >= 0) & (v + w <= 1) & (t >= 0) & (t <= 1)).any():
       return True

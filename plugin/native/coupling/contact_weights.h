@@ -157,17 +157,26 @@ PALPATE bool is_mine(const Fields& f, const char* contact) {
   return false;
 }
 
-// Opens the contacts of needles with the tissue that they are in. Done twice it does nothing.
+// Opens the contacts of needles, and of their threads, with the tissue that they are in. Done twice it does nothing.
 template <class Fields>
 PALPATE void lift(const Fields& f, Thread, int) {
   char* const contacts = datum<char*>(f, DATA_CONTACT);
   const int ncon = datum<int>(f, DATA_NEFC) > 0 ? datum<int>(f, DATA_NCON) : 0;
   for (int c = 0; c < ncon; ++c) {
-    const char* contact = contacts + (size_t)CONTACT_LENGTH * c;
+    char* contact = contacts + (size_t)CONTACT_LENGTH * c;
     for (int side = 0; side < 2; ++side) {
       const int flex = side_of(contact, CONTACT_FLEX, side), geom = side_of(contact, CONTACT_GEOM, 1 - side);
-      if (flex < 0 || geom < 0 || !f.lifted.data[f.ngeom * flex + geom]) continue;
+      const int other = side_of(contact, CONTACT_FLEX, 1 - side);
+      if (flex < 0) continue;
+      const int* lifted = f.lifted.data + (f.ngeom + 2 * f.nflex) * flex;
+      if (geom >= 0 && !lifted[geom]) continue;
+      if (geom < 0) {
+        const int elem = side_of(contact, CONTACT_ELEM, 1 - side), vert = side_of(contact, CONTACT_VERT, 1 - side);
+        const int edge = elem >= 0 ? elem : vert, *part = lifted + f.ngeom + 2 * other;
+        if (other < 0 || edge < part[0] || edge >= part[1]) continue;
+      }
       const Rows rows = rows_of(f, contact);
+      *(double*)(contact + CONTACT_DIST) = OPEN;  // which others make rows of again
       for (int r = 0; r < rows.normals().count; ++r) datum<double*>(f, DATA_EFC_POS)[rows.first + r] = OPEN;
     }
   }

@@ -10,6 +10,10 @@
 // its thickness. Holes are held across the needle; along it each is dragged by friction, a force by length of the
 // needle in tissue (Okamura et al. 2004, doi:10.1109/TBME.2004.831542), that sticks or slips.
 //
+// Where the swage has gone through, a hole holds the thread by its nearest point: across it by a spring, along it by
+// friction, which bears T (exp(mu theta) - 1), T the smaller one of the tensions on both sides and theta the angle
+// between them (the capstan's law), and that by length.
+//
 // Both ends are implicit. The tissue has the springs in its matrix and takes the needle to move on as it does, the
 // needle their part of its inertia in MuJoCo's: each end alone, which is stable whatever either weighs (for two
 // points, stiffness and masses over five decades, no mode of the pair grows).
@@ -28,6 +32,9 @@ constexpr int POINTS = HOLES + 1;  // that hold a needle; the last is its tip
 constexpr double POINT = 0.1, CLEAR = 0.04;
 constexpr double SKIDS = 2.0;   // times its way along a needle that a tip is off its seat before it lets go
 constexpr double BELOW = 0.02;  // edges under the surface where a tip is in a solid
+constexpr int FASTEST = 8;  // edges that a thread slides through a hole in a step, at most
+constexpr int BESIDE = 2;  // edges from the one that is in a hole to those that tell how a thread turns there
+constexpr double SLOW = 1e-4;  // velocity below which a thread's friction is viscous, as in rods [m/s]
 constexpr double TIGHT = 1e-9;  // of what tissue bears, to which a return mapping brings it
 constexpr double APART = 0.5;   // edges between holes in a solid, at least
 
@@ -36,7 +43,7 @@ PALPATE Fields of_world(Fields f, int world) {
   move_bodies(f.mj, world);
   move_nodes(f.own, world);
   move_input(f.solve, world);
-  move_each(world, f.state, f.next, f.law, f.force, f.point, f.share, f.held, f.hold, f.weight, f.lifted);
+  move_each(world, f.state, f.next, f.law, f.force, f.point, f.share, f.held, f.hold, f.feels, f.pull, f.weight, f.lifted);
   move_to(f.mj.M, world);
   move_to(f.elem, f.mesh.data[world]), move_to(f.tet, f.mesh.data[world]);
   move_to(f.flat, f.mesh.data[world]);
@@ -99,6 +106,7 @@ PALPATE void put_seat(double* elem, int which, D3 shares) {
 }
 
 PALPATE double* hole(double* s, int h) { return s + NEEDLE_HOLE + HOLE_LENGTH * h; }
+PALPATE bool on_thread(double* s, int h) { return hole(s, h)[HOLE_THREAD] > 0.0; }
 PALPATE int kind_of(double* s, int h) { return (int)hole(s, h)[HOLE_KIND]; }
 PALPATE bool in_solid(int kind) { return kind == INTO || kind == WITHIN; }
 
@@ -115,8 +123,42 @@ PALPATE Seat seat_of_hole(const Fields& f, double* s, int h) {
 
 template <class Fields>
 PALPATE double place_of_hole(const Fields& f, const Arc& arc, double* s, int h) {
-  return arc.nearest(seat_of_hole(f, s, h).at);
+  return on_thread(s, h) ? 0.0 : arc.nearest(seat_of_hole(f, s, h).at);
 }
+
+// The thread of a needle, from the swage on: its nodes are bodies.
+template <class Fields>
+struct Strand {
+  const Fields& f;
+  int first, count;
+
+  PALPATE double edge(int e) const { return f.edges.data[2 * (first + e)]; }
+  PALPATE double length() const {
+    double sum = 0.0;
+    for (int e = 0; e + 1 < count; ++e) sum += edge(e);
+    return sum;
+  }
+  PALPATE D3 at(int n) const {
+    const int b = f.node.data[first + n];
+    const D3 p = load(f.mj.xpos.data + 3 * b) + turned(f.mj.xmat.data + 9 * b, load(f.local.data + 3 * (first + n)));
+    return add_turned({0.0, 0.0, 0.0}, f.own.frame.data, p - load(f.own.origin.data));
+  }
+  PALPATE D3 vel(int n) const {
+    const int b = f.node.data[first + n];
+    return velocity_of(f, b, twist(f.mj, b, false), at(n));
+  }
+  PALPATE double tension(int e) const {
+    const double T = f.edges.data[2 * (first + e) + 1] * (norm(at(e + 1) - at(e)) - edge(e));
+    return T > 0.0 ? T : 0.0;
+  }
+  // The edge that has a place, and its share there.
+  PALPATE int find(double place, double& part) const {
+    int e = 0;
+    for (; e + 2 < count && place > edge(e); ++e) place -= edge(e);
+    part = place < edge(e) ? place / edge(e) : 1.0;
+    return e;
+  }
+};
 
 // Makes a hole at the tip's seat.
 PALPATE void make_hole(double* s, int kind, double place) {
@@ -124,18 +166,14 @@ PALPATE void make_hole(double* s, int kind, double place) {
   double* made = hole(s, count);
   made[HOLE_KIND] = kind;
   made[HOLE_SLIP] = place;
+  made[HOLE_THREAD] = 0.0;
   for (int c = 0; c < 4; ++c) made[HOLE_ELEM + c] = s[NEEDLE_ELEM + c];
   s[NEEDLE_COUNT] = count + 1;
 }
 
-// Closes holes that the tip has been drawn out of, and lets go of those that the swage has left.
 template <class Fields>
-PALPATE void close_holes(const Fields& f, const Arc& arc, double* s) {
-  int count = (int)s[NEEDLE_COUNT], gone = 0;
-  while (count > 0 && place_of_hole(f, arc, s, count - 1) > arc.length) --count;
-  while (gone < count && place_of_hole(f, arc, s, gone) < 0.0) ++gone;
-  for (int c = 0; c < HOLE_LENGTH * (count - gone); ++c) hole(s, 0)[c] = hole(s, gone)[c];
-  s[NEEDLE_COUNT] = count - gone;
+PALPATE Strand<Fields> strand_of(const Fields& f, int i) {
+  return {f, f.strand.data[2 * i], f.strand.data[2 * i + 1]};
 }
 
 // Finds the triangle that a line goes through, nearest to its end; one whose normal is along the line by `facing`
@@ -253,10 +291,12 @@ PALPATE void cut_way(const Fields& f, Thread t, int i, const Arc& arc, double* s
   put_seat(s + NEEDLE_ELEM, elem, {w.y, w.z, 0.0});
 }
 
-// Adds a force on a point of tissue, at a place of the needle, that falls by `hold` dv / h in the step.
+// Adds a force on a point of tissue, at a place of the needle, that falls by `hold` dv / h in the step; it is the needle
+// that feels it, or the thread by itself.
 template <class Fields>
-PALPATE void tie(const Fields& f, Thread t, int at, const Seat& seat, D3 place, D3 force, const Sym& hold) {
+PALPATE void tie(const Fields& f, Thread t, int at, const Seat& seat, D3 place, D3 force, const Sym& hold, bool feels) {
   if (t.tid > 0) return;
+  f.feels.data[at] = feels;
   store(f.force.data + 3 * at, force);
   store(f.point.data + 3 * at, place);
   const double entries[6] = {hold.xx, hold.xy, hold.xz, hold.yy, hold.yz, hold.zz};
@@ -274,6 +314,116 @@ PALPATE Sym across_and_along(double a, double b, D3 n) {
   return {a + c * n.x * n.x, c * n.x * n.y, c * n.x * n.z, a + c * n.y * n.y, c * n.y * n.z, a + c * n.z * n.z};
 }
 
+// A hole's thread: the edge that is in it, the share of that, and how it is there. It turns by `angle` between edges
+// beside that, far enough for a thread that resists bending; the needle itself is what is before the first one. It slides along the mean of both, so that equal
+// tensions do not make it slide wherever on the edge it is.
+struct Passing { int edge; double part, angle; D3 at, vel, along; };
+
+template <class Fields>
+PALPATE Passing passing(const Fields& f, int i, const Arc& arc, double place) {
+  const auto thread = strand_of(f, i);
+  Passing out;
+  const int e = out.edge = thread.find(place, out.part);
+  const D3 from = thread.at(e), to = thread.at(e + 1), zero = {0.0, 0.0, 0.0};
+  out.at = (1.0 - out.part) * from + out.part * to;
+  out.vel = (1.0 - out.part) * thread.vel(e) + out.part * thread.vel(e + 1);
+  const int first = e > BESIDE ? e - BESIDE : 0, last = e + BESIDE + 2 < thread.count ? e + BESIDE : thread.count - 2;
+  const D3 before = e ? unit_of(thread.at(first + 1) - thread.at(first)) : zero - arc.along(0.0);
+  const D3 after = unit_of(thread.at(last + 1) - thread.at(last));
+  const D3 both = before + after;
+  out.angle = atan2(norm(cross(before, after)), dot(before, after));
+  out.along = norm(both) > 0.1 ? unit_of(both) : unit_of(to - from);
+  return out;
+}
+
+// Follows a thread that has slid through a hole: to where it is beside the tissue, on that edge or
+// some beside it.
+template <class Fields>
+PALPATE void follow_thread(const Fields& f, int i, const Arc& arc, double* s, int n) {
+  const auto thread = strand_of(f, i);
+  double& place = hole(s, n)[HOLE_THREAD];
+  const Passing by = passing(f, i, arc, place);
+  const D3 p = seat_of_hole(f, s, n).at;
+  double start = 0.0;
+  for (int e = 0; e < by.edge; ++e) start += thread.edge(e);
+  for (int e = by.edge, turns = 0; turns < FASTEST; ++turns) {
+    const D3 way = thread.at(e + 1) - thread.at(e);
+    const double ahead = dot(p - thread.at(e), by.along), whole = dot(way, by.along);
+    const double share = whole > 0.1 * norm(way) ? ahead / whole : by.part;
+    place = start + (share < 0.0 ? 0.0 : share > 1.0 ? 1.0 : share) * thread.edge(e);
+    if (share > 1.0 && e + 2 < thread.count)
+      start += thread.edge(e++);
+    else if (share < 0.0 && e > 0)
+      start -= thread.edge(--e);
+    else
+      break;
+  }
+  if (place > 0.0) return;  // else on the needle again, if that is there
+  const double there = arc.nearest(p);
+  if (norm(arc.place(there < 0.0 ? 0.0 : there) - p) < thread.edge(0)) place = hole(s, n)[HOLE_SLIP] = 0.0;
+  else place = 2.0 * thread.length();
+}
+
+// What friction of a thread in a hole bears along it, of the difference of the tensions on both sides of the edge that is
+// in it.
+template <class Fields>
+PALPATE double thread_friction(const Fields& f, int i, const Passing& by, const Seat& seat, double* s, int n) {
+  const double* law = f.law.data + PIERCE_LENGTH * i;
+  const auto thread = strand_of(f, i);
+  const int e = by.edge;
+  const double back = e + 2 == thread.count ? 0.0 : thread.tension(e + 1), pull = thread.tension(e ? e - 1 : 0);
+  const bool in = kind_of(s, n) == INTO && n + 1 < (int)s[NEEDLE_COUNT], out = kind_of(s, n) == OUT && n > 0;
+  const double length = in || out ? 0.5 * norm(seat.at - seat_of_hole(f, s, in ? n + 1 : n - 1).at) : law[PIERCE_WALL];
+  const double most = (pull < back ? pull : back) * (exp(law[PIERCE_CAPSTAN] * by.angle) - 1.0);
+  return cos(0.5 * by.angle) * (most + law[PIERCE_FRICTION] * length);
+}
+
+// Holds a thread in a hole: by the force that its step has found, and less as the tissue then follows it.
+template <class Fields>
+PALPATE void tie_thread(const Fields& f, Thread t, int i, int n, const Arc& arc, double weight, double h, double* s) {
+  const Seat seat = seat_of_hole(f, s, n);
+  const Passing by = passing(f, i, arc, hole(s, n)[HOLE_THREAD]);
+  const double slides = fabs(dot(by.vel - seat.vel, by.along));
+  const double drag = thread_friction(f, i, by, seat, s, n) / (slides > SLOW ? slides : SLOW);
+  const D3 force = load(f.pull.data + 3 * (POINTS * i + n));
+  tie(f, t, POINTS * i + n, seat, by.at, force, across_and_along(weight, h * drag, by.along), false);
+}
+
+// Closes holes that the tip has been drawn out of, and lets go of those that the swage has left, or hands them to the
+// thread, those in the surface. It may come back, or end.
+template <class Fields>
+PALPATE void close_holes(const Fields& f, int i, const Arc& arc, double* s) {
+  const auto thread = strand_of(f, i);
+  int count = (int)s[NEEDLE_COUNT], kept = 0;
+  while (count > 0 && place_of_hole(f, arc, s, count - 1) > arc.length) --count;
+  for (int h = 0; h < count; ++h) {
+    double* from = hole(s, h);
+    const double place = place_of_hole(f, arc, s, h);
+    if (on_thread(s, h) ? from[HOLE_THREAD] > (1.0 - 1e-9) * thread.length()
+                        : place < 0.0 && (!thread.count || kind_of(s, h) == WITHIN))
+      continue;
+    if (!on_thread(s, h) && place < 0.0) from[HOLE_THREAD] = -place;
+    for (int c = 0; c < HOLE_LENGTH; ++c) hole(s, kept)[c] = from[c];
+    ++kept;
+  }
+  s[NEEDLE_COUNT] = kept;
+  for (int h = 0; h < kept; ++h)
+    if (on_thread(s, h)) follow_thread(f, i, arc, s, h);
+}
+
+// Holds a thread in a hole.
+template <class Fields>
+PALPATE void tie_thread(const Fields& f, Thread t, int i, int n, double k, double weight, double h, double* s) {
+  const auto thread = strand_of(f, i);
+  double part = 0.0;
+  const int e = thread.find(hole(s, n)[HOLE_THREAD], part);
+  const Seat seat = seat_of_hole(f, s, n);
+  const D3 at = (1.0 - part) * thread.at(e) + part * thread.at(e + 1);
+  const D3 vel = (1.0 - part) * thread.vel(e) + part * thread.vel(e + 1), along = {1.0, 0.0, 0.0};
+  const D3 force = k * (at - seat.at + h * (vel - seat.vel));
+  tie(f, t, POINTS * i + n, seat, at, force, across_and_along(2.0 * weight, 2.0 * weight, along), false);
+}
+
 // Ties a needle to its holes and its tip to its seat. What has slipped, as the step begins, bears a constant force,
 // so that it does not hang on speed.
 template <class Fields>
@@ -284,7 +434,13 @@ PALPATE void tie_needle(const Fields& f, Thread t, int i, const Arc& arc, const 
   const double k = law[PIERCE_STIFFNESS], weight = k * f.gain * h * h;
   const int count = (int)s[NEEDLE_COUNT], b = f.body.data[i];
   double before = 0.0;  // the last hole's place
+  int ties = 0;
   for (int n = 0; n < count; ++n) {
+    if (on_thread(s, n)) {
+      tie_thread(f, t, i, n, arc, weight, h, s);
+      continue;
+    }
+    ++ties;
     const Seat seat = seat_of_hole(f, s, n);
     const double place = arc.nearest(seat.at);
     // Half the way to each neighbour with tissue between; all of it to the tip.
@@ -302,9 +458,8 @@ PALPATE void tie_needle(const Fields& f, Thread t, int i, const Arc& arc, const 
     if (slips) slip = place + (off > 0.0 ? slack : -slack);
     const double drags = k * (slip - place + (slips ? 0.0 : reach * dot(rel, along)));
     const D3 force = k * across(at - seat.at + reach * rel, along) + drags * along;
-    tie(f, t, POINTS * i + n, seat, at, force, across_and_along(weight, slips ? 0.0 : weight, along));
+    tie(f, t, POINTS * i + n, seat, at, force, across_and_along(weight, slips ? 0.0 : weight, along), true);
   }
-  int ties = count;
   if (s[NEEDLE_STAGE] != AWAY) {
     const bool inside = s[NEEDLE_STAGE] == INSIDE;
     const Seat seat = seat_of(f, s + NEEDLE_ELEM, inside);
@@ -314,15 +469,16 @@ PALPATE void tie_needle(const Fields& f, Thread t, int i, const Arc& arc, const 
     const bool sticks = press > 0.0 && press < bears - TIGHT * bears;
     const double axial = sticks ? press + k * reach * dot(rel, along) : press > 0.0 ? bears : 0.0;
     const D3 force = k * across(at - seat.at + reach * rel, along) + axial * along;
-    tie(f, t, POINTS * i + HOLES, seat, at, force, across_and_along(weight, sticks ? weight : 0.0, along));
+    tie(f, t, POINTS * i + HOLES, seat, at, force, across_and_along(weight, sticks ? weight : 0.0, along), true);
     ++ties;
   }
   if (t.tid > 0) return;
   f.weight.data[i] = ties * weight;
-  if (ties) f.solve.quiet.data[0] = 0.0;
+  if (ties || count) f.solve.quiet.data[0] = 0.0;
 }
 
-// Says which of a needle's geoms do not touch the organ: those from a little before its first hole on, or its point.
+// Says which of a needle's geoms do not touch the organ: those from a little before its first hole on, or its point;
+// and which edges of its thread.
 template <class Fields>
 PALPATE void lift_contacts(const Fields& f, int i, const Arc& arc, double* s) {
   double low = arc.length;
@@ -333,6 +489,66 @@ PALPATE void lift_contacts(const Fields& f, int i, const Arc& arc, double* s) {
   low -= f.law.data[PIERCE_LENGTH * i + PIERCE_MARGIN];
   for (int g = 0; g < f.nlisted; ++g)
     if (f.whose.data[g] == i) f.lifted.data[f.geom.data[g]] = f.end.data[g] > low;
+  const auto thread = strand_of(f, i);
+  if (!thread.count) return;
+  double near = thread.length(), far = -1.0, part;
+  for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
+    const double place = hole(s, n)[HOLE_THREAD];  // 0 on the needle: its end may touch
+    near = place < near ? place : near;
+    far = place > far ? place : far;
+  }
+  const double margin = f.law.data[PIERCE_LENGTH * i + PIERCE_CLOSE];
+  int* edges = f.lifted.data + f.ngeom + 2 * f.strand_flex.data[i];
+  edges[0] = edges[1] = 0;
+  if (far < 0.0) return;
+  edges[0] = near > margin ? thread.find(near - margin, part) : 0;
+  edges[1] = thread.find(far + margin, part) + 1;
+}
+
+// Says what holds a needle's thread, as the step begins: the points of the tissue where they will be.
+template <class Fields>
+PALPATE void aim_thread(const Fields& all, Thread t, int i) {
+  const auto& f = all.pierced;
+  double s[NEEDLE_LENGTH];
+  for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
+  const Arc arc = arc_of(f, i);
+  close_holes(f, i, arc, s);
+  lift_contacts(f, i, arc, s);
+  all.first.data[0] = all.tie_count.data[0];
+  for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
+    const int at = all.tie_count.data[0];
+    if (!on_thread(s, n) || at == MOST_TIES) continue;
+    double* tie = all.tie_value.data + 13 * at;
+    const Seat seat = seat_of_hole(f, s, n);
+    const Passing by = passing(f, i, arc, hole(s, n)[HOLE_THREAD]);
+    D3 vel = {0.0, 0.0, 0.0};
+    for (int c = 0; c < seat.count; ++c) vel += seat.share[c] * goes_by(f.mj, f.own, seat.vert[c]);
+    const D3 goes = in_world(f.own.frame.data, f.own.origin.data, seat.at + f.mj.timestep.data[0] * vel);
+    store(tie + 1, add_turned({0.0, 0.0, 0.0}, all.frame.data, goes - load(all.origin.data)));
+    tie[0] = by.part;
+    tie[4] = f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
+    tie[5] = thread_friction(f, i, by, seat, s, n);
+    tie[6] = dot(by.at - seat.at, by.along);
+    store(tie + 7, add_turned({0.0, 0.0, 0.0}, all.frame.data, turned(f.own.frame.data, by.along)));
+    all.tie_edge.data[at] = by.edge;
+    all.tie_count.data[0] = at + 1;
+  }
+}
+
+// Takes the forces that the thread's step has found, in the order in which it was told what holds it.
+template <class Fields>
+PALPATE void feel_thread(const Fields& all, Thread t, int i) {
+  const auto& f = all.pierced;
+  double s[NEEDLE_LENGTH];
+  for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
+  close_holes(f, i, arc_of(f, i), s);
+  int at = all.first.data[0];
+  for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
+    if (!on_thread(s, n)) continue;
+    const D3 zero = {0.0, 0.0, 0.0};
+    const D3 force = at < MOST_TIES ? turned(all.frame.data, load(all.tie_value.data + 13 * at++ + 10)) : zero;
+    store(f.pull.data + 3 * (POINTS * i + n), add_turned(zero, f.own.frame.data, zero - force));
+  }
 }
 
 template <class Fields>
@@ -345,7 +561,7 @@ PALPATE void enter_needles(const Fields& given, Thread t, int) {
     const Arc arc = arc_of(f, i);
     const int b = f.body.data[i];
     const Twist moving = twist(f.mj, b, false);
-    close_holes(f, arc, s);
+    close_holes(f, i, arc, s);
     if (s[NEEDLE_STAGE] == INSIDE && !goes_in(s)) s[NEEDLE_STAGE] = AWAY;
     if (s[NEEDLE_STAGE] == INSIDE) cut_way(f, t, i, arc, s);
     if (s[NEEDLE_STAGE] == AWAY) touch(f, t, i, arc, velocity_of(f, b, moving, arc.place(arc.length)), s);
@@ -403,6 +619,7 @@ PALPATE void act_needles(const Fields& given, Thread t, int) {
       const Sym hold = {p[0], p[1], p[2], p[3], p[4], p[5]};
       const D3 force = ok && shares > 0.0 ? load(f.force.data + 3 * at) - (1.0 / h) * (hold * dv) : zero;
       store(f.force.data + 3 * at, force);
+      if (shares == 0.0 || !f.feels.data[at]) continue;
       const D3 push = zero - turned(f.own.frame.data, force);
       sum += push;
       torque += cross(arm_of(f.mj, b, in_world(f.own.frame.data, f.own.origin.data, load(f.point.data + 3 * at))), push);
