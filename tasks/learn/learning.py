@@ -249,7 +249,8 @@ class Learner(Student):
     )  # fmt: skip
     self._ppo = PPO(
       networks.actor, networks.critic, storage, device=networks.device,
-      num_learning_epochs=settings.epochs, num_mini_batches=settings.minibatches,
+      num_learning_epochs=settings.epochs,
+      num_mini_batches=min(settings.minibatches, env.num_envs),  # each has whole worlds
       gamma=settings.gamma, lam=settings.lam, entropy_coef=settings.entropy,
       learning_rate=settings.learning_rate,
     )  # fmt: skip
