@@ -255,6 +255,9 @@ class Recording:
         raise ValueError(f"it declares {size} bytes, expected at most {_MOST}")
       if broken := archive.testzip():
         raise ValueError(f"{broken} fails its checksum")
+      file.seek(-12, os.SEEK_END)  # zipfile does not miss what the end of the list says there is
+      if (count := int.from_bytes(file.read(2), "little")) != (have := len(archive.infolist())):
+        raise ValueError(f"it lists {have} entries of {count}")
     file.seek(0)
     tables: dict[str, dict[str, np.ndarray]] = {table: {} for table in _TABLES.values()}
     with np.load(file, allow_pickle=False) as archive:
