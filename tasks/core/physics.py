@@ -160,7 +160,7 @@ class Physics(Instrument, Portable):
     mj.mj_getState(self.model.ptr, self.data.ptr, state, STATE)
     return state
 
-  def free(self, name: str) -> np.ndarray:
+  def free_pose(self, name: str) -> np.ndarray:
     """Returns place [m] and orientation, w x y z, of the body of a free joint  (7,)."""
     return self.data.ptr.joint(name).qpos
 

@@ -257,7 +257,7 @@ def other_pinch(s: Any) -> float:
 
 def needle_place(s: Any, place: np.ndarray) -> np.ndarray:
   """Returns where a place in the frame of the free body `needle` is [m]."""
-  row, moved = s.free("needle"), np.zeros(3)
+  row, moved = s.free_pose("needle"), np.zeros(3)
   mj.mju_rotVecQuat(moved, place, row[3:])
   return row[:3] + moved
 
