@@ -16,7 +16,7 @@ from palpate.batch.threads import Threads
 from palpate.models import trocar
 from palpate.tasks.core import episode, jaws
 from palpate.tasks.core.environment import Environment
-from palpate.tasks.core.instrument import AROUND, FIFTH, FORCES, RATES, TOUCH, axes, jawed
+from palpate.tasks.core.instrument import AROUND, DRIVE_RATES, FIFTH, FORCES, TOUCH, axes, jawed
 from palpate.tasks.core.scenes import GUIDED
 from palpate.tasks.core.stage import STATE
 from palpate.tissue.types import allocate
@@ -139,7 +139,7 @@ class Worlds:
     coarse = physics.coarse
     constants = {
       "drive": drives, "low": controls[:, 0], "high": controls[:, 1],
-      "move": np.array(RATES[: len(names)]) * dt, "wrist": port.wrist or (0.0, 0.0),
+      "move": DRIVE_RATES[: len(names)] * dt, "wrist": port.wrist or (0.0, 0.0),
       "elem": self.organ.elem, "coarse": coarse, "coarse0": physics.organ.xpos0[coarse],
     }  # fmt: skip
     bonds = physics.organ.bonds

@@ -19,14 +19,13 @@ FIFTH = ("jaw", "head")  # what a fifth component of an action drives
 TOUCH = ("touch_left", "touch_right")  # sensors of the jaws
 FORCES = ("tip_force", "shaft_force")  # sensors of what an instrument exerts
 AROUND = tuple(f"{situs.SURROUNDINGS}_{part}" for part in ("tip", "shaft"))  # and of that around
-# Pitch, yaw, roll [rad/s], insertion [m/s], and the axes of a wrist [rad/s].
-RATES = (1.0, 1.0, 3.0, 0.12, 3.0, 3.0)
+RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
 
 CLOSING = 0.005  # the drive's target is that far below the opening [rad]
 # Least opening over a fold of tissue, largest target that grips one [rad].
 FOLD, GRIPPING = 0.02, 0.15
-_RATES = np.array(RATES)
+DRIVE_RATES = np.array((*RATES, 3.0, 3.0))  # and those of a wrist [rad/s]
 
 
 def axes(prefix: str) -> tuple[str, ...]:
@@ -232,7 +231,7 @@ class Instrument:
       return
     low, high = self.drive_range.T
     ctrl, count = self.data.ptr.ctrl, len(self.drives)
-    move = values[:count] * _RATES[:count] * dt
+    move = values[:count] * DRIVE_RATES[:count] * dt
     ctrl[self.drives] = (ctrl[self.drives] + move).clip(low, high)
     if self.fifth >= 0:
       self.drive_fifth(values[count])

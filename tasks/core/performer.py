@@ -32,7 +32,7 @@ from palpate.models import laparoscope, trocar, wrist
 
 from ..learn import policy
 from .environment import Environment
-from .instrument import RATES
+from .instrument import DRIVE_RATES
 
 Act = Callable[[Any], Any]
 Script = Iterator[np.ndarray]
@@ -293,7 +293,7 @@ class Performer:
       pitch, yaw, insertion = trocar.inverse(self.trocar, tip, check=False)
       goal = np.array([pitch, yaw, roll, insertion])
     goal = self.drive(goal)
-    move = (goal - self.hand.drive_targets()) / (np.array(RATES[: len(goal)]) * self.dt)
+    move = (goal - self.hand.drive_targets()) / (DRIVE_RATES[: len(goal)] * self.dt)
     return np.concatenate([np.clip(move, -1, 1), extra])
 
   def drive(self, goal: np.ndarray) -> np.ndarray:
