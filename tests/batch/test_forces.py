@@ -184,7 +184,7 @@ def test_windowed_organs_are_taken_out_of_a_scene():
   made = scene()
   model, data, _ = load(made, NAMES[0])
   declared = [workspace(palpate.Organ(model, data, name)).organ for name in NAMES]
-  bare, slots = strip_organs.strip(mujoco.MjSpec.from_string(made), model, declared, [5, 6, 7])
+  bare, slots = strip_organs.strip(mujoco.MjSpec.from_string(made), model, declared, [5, 6, 7], [])
   assert bare.nplugin == 0 and bare.nflex == 3 and [each.nslot for each in slots] == [5, 6, 7]
 
 

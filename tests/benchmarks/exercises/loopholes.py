@@ -30,7 +30,7 @@ from benchmarks import plots, results
 from benchmarks.runner import SEED, Bench, Case, Row
 from palpate import tasks
 from palpate.tasks import suite
-from palpate.tasks.core import base, episode, performer
+from palpate.tasks.core import episode, instrument, performer
 from palpate.tasks.core.environment import CONTROL_TIMESTEP
 from palpate.tasks.people import score
 
@@ -120,8 +120,8 @@ class Attack:
     options = {} if kind == "styled" else {"time_limit": hands * length}
     self.env = tasks.load(*suite.split(name), {"random": 0, **options})
     self.name, self.kind, self.steps = name, kind, round(hands * length / CONTROL_TIMESTEP)
-    extra = len(self.env.task.components) - hands * len(base.AXES)
-    self.width = extra + hands * (len(base.AXES) if kind == "blind" else 3)
+    extra = len(self.env.task.components) - hands * len(instrument.AXES)
+    self.width = extra + hands * (len(instrument.AXES) if kind == "blind" else 3)
     self.size = len(MANNERS) if kind == "styled" else PHASES * self.width
     self._script = self.env.task.expert
 
