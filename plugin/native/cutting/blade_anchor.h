@@ -41,10 +41,10 @@ PALPATE double crossing(const Line& s, const D3* x, D3& weight) {
   return v < 0.0 || w < 0.0 || v + w > 1.0 || t > s.length ? -1.0 : t;
 }
 
-// Finds where a blade goes through the surface, nearest to one of its ends; returns how far that end is
-// beyond it, or -1.
-template <class Fields>
-PALPATE double enters(const Fields& f, Thread me, const Line& s, int& elem, D3& weight) {
+// Finds the triangle that a line goes through with the least `beyond` of its corners and of how far from the line's
+// end that is, NOWHERE for one that does not count; returns the least, or -1.
+template <class Fields, class Beyond>
+PALPATE double find_crossing(const Fields& f, Thread me, const Line& s, int& elem, D3& weight, Beyond beyond) {
   const D3 half = (0.5 * s.length) * s.along, middle = s.from + half, reach = vabs(half);
   const D3 zero = {0.0, 0.0, 0.0};
   double least = NOWHERE;
@@ -54,12 +54,22 @@ PALPATE double enters(const Fields& f, Thread me, const Line& s, int& elem, D3& 
     const D3 low = zero - vmax(vmax(zero - x[0], zero - x[1]), zero - x[2]);
     const D3 high = vmax(vmax(x[0], x[1]), x[2]), off = vmax(low - middle, middle - high) - reach;
     if (off.x > 0.0 || off.y > 0.0 || off.z > 0.0) continue;
-    const double at = crossing(s, x, w), beyond = at < s.length - at ? at : s.length - at;
-    if (at < 0.0 || beyond >= least) continue;
-    least = beyond, elem = t, weight = w;
+    const double at = crossing(s, x, w);
+    if (at < 0.0) continue;
+    const double far = beyond(x, at);
+    if (far >= least) continue;
+    least = far, elem = t, weight = w;
   }
   agree(least, elem, weight);
   return least < NOWHERE ? least : -1.0;
+}
+
+// Finds where a blade goes through the surface, nearest to one of its ends; returns how far that end is
+// beyond it, or -1.
+template <class Fields>
+PALPATE double enters(const Fields& f, Thread me, const Line& s, int& elem, D3& weight) {
+  return find_crossing(f, me, s, elem, weight,
+                       [&](const D3*, double at) { return at < s.length - at ? at : s.length - at; });
 }
 
 // Finds the point of the surface at rest that is nearest to a place: its triangle and weights.

@@ -180,21 +180,9 @@ PALPATE Strand<Fields> strand_of(const Fields& f, int i) {
 // (1 along, -1 against, 0 either).
 template <class Fields>
 PALPATE bool find_triangle(const Fields& f, Thread me, const Line& s, int facing, int& elem, D3& weight) {
-  const D3 half = (0.5 * s.length) * s.along, middle = s.from + half, reach = vabs(half), zero = {0.0, 0.0, 0.0};
-  double least = NOWHERE;
-  for (int t = me.tid; t < f.nelem; t += me.nthread) {
-    D3 x[3], w;
-    corners_now(f, t, x);
-    const D3 low = zero - vmax(vmax(zero - x[0], zero - x[1]), zero - x[2]);
-    const D3 high = vmax(vmax(x[0], x[1]), x[2]), off = vmax(low - middle, middle - high) - reach;
-    if (off.x > 0.0 || off.y > 0.0 || off.z > 0.0) continue;
-    if (facing * dot(cross(x[1] - x[0], x[2] - x[0]), s.along) < 0.0) continue;
-    const double at = crossing(s, x, w);
-    if (at < 0.0 || s.length - at >= least) continue;
-    least = s.length - at, elem = t, weight = w;
-  }
-  agree(least, elem, weight);
-  return least < NOWHERE;
+  return find_crossing(f, me, s, elem, weight, [&](const D3* x, double at) {
+    return facing * dot(cross(x[1] - x[0], x[2] - x[0]), s.along) < 0.0 ? NOWHERE : s.length - at;
+  }) >= 0.0;
 }
 
 // Puts the tip of a needle that goes through the surface on its seat there.
