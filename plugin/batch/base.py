@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import mujoco
 import numpy as np
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
   from palpate.camera import Camera
 
 _MOVING = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "plugin_state")
+
+
+_T = TypeVar("_T")
 
 
 class Batch(abc.ABC):
@@ -170,15 +173,12 @@ class Batch(abc.ABC):
     Raises:
       ValueError: the scene has no organ of that name; the message lists those it has.
     """
-    if name not in self.organs:
-      have = ", ".join(map(repr, self.organs)) or "none"
-      raise ValueError(f"no organ {name!r} in the batch, it has {have}")
-    return self.organs[name]
+    return _listed("organ", self.organs, name)
 
   @property
+  @abc.abstractmethod
   def threads(self) -> Mapping[str, Thread]:
     """The threads by name."""
-    raise ValueError("worlds on several devices have their threads in `parts`")
 
   def thread(self, name: str) -> Thread:
     """Returns a thread.
@@ -186,10 +186,7 @@ class Batch(abc.ABC):
     Raises:
       ValueError: the scene has no thread of that name; the message lists those it has.
     """
-    if name not in self.threads:
-      have = ", ".join(map(repr, self.threads)) or "none"
-      raise ValueError(f"no thread {name!r} in the batch, it has {have}")
-    return self.threads[name]
+    return _listed("thread", self.threads, name)
 
   # Pictures.
 
@@ -561,3 +558,11 @@ def _named(find: Any, kind: str, name: str) -> Any:
   except KeyError as error:
     have = error.args[0].partition(". ")[2]
     raise ValueError(f"no {kind} {name!r} in the model. {have}") from None
+
+
+def _listed(kind: str, things: Mapping[str, _T], name: str) -> _T:
+  """Returns what has a name; ValueError lists the names that there are."""
+  if name not in things:
+    have = ", ".join(map(repr, things)) or "none"
+    raise ValueError(f"no {kind} {name!r} in the batch, it has {have}")
+  return things[name]

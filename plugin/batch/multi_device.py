@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 from palpate.tissue.cutting.topology import Report
 
-from .base import Batch, Contacts, Tissue, on_device, spread
+from .base import Batch, Contacts, Thread, Tissue, on_device, spread
 from .bonds import Gathered
 from .cutting.fracture import Cutters
 from .worlds import Worlds
@@ -61,6 +61,11 @@ class Several(Batch):
   def organs(self) -> dict[str, Tissue]:
     """The organs by name."""
     return dict(self._organs)
+
+  @property
+  def threads(self) -> dict[str, Thread]:
+    """Raises ValueError: they are in the parts."""
+    raise ValueError("worlds on several devices have their threads in `parts`")
 
   def gather(self, arrays: Sequence[wp.array], out: wp.array) -> wp.array:
     """Copies an array of each part to one of all worlds."""
