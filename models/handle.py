@@ -139,8 +139,7 @@ class Tip:
   def put(self, joints: wrist.Joints) -> None:
     """Takes the pose that joints give  (4,) or (6,)."""
     self.pos, mat = wrist.forward(self.port, joints)
-    self.quat = np.zeros(4)
-    mujoco.mju_mat2Quat(self.quat, mat.ravel())
+    self.quat = ports.orientation(mat)
     self._ctrl[self._drives] = joints
 
   def move(
@@ -182,10 +181,8 @@ class Shaft:
 
   def __init__(self, trocar: ports.Trocar):
     """Takes the instrument's trocar."""
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(trocar.mat).ravel())
     self._pos, self._mat = trocar.pos.tolist(), trocar.mat.T.tolist()
-    w, x, y, z = quat.tolist()
+    w, x, y, z = ports.orientation(trocar.mat).tolist()
     self._quat: Quat = (w, x, y, z)
     self.reach = tuple(float(trocar.depth + x) for x in trocar.ranges[2])  # of the tip [m]
 

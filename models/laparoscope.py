@@ -11,7 +11,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from .trocar import Trocar, forward, inverse
+from .trocar import Trocar, about, forward, inverse
 
 NAME = "laparoscope"
 OPTICS = math.radians(30.0)
@@ -42,8 +42,8 @@ def view(port: Trocar, joints, optics: float = OPTICS) -> tuple[np.ndarray, np.n
     optics: angle between shaft and view
   """
   pitch, yaw, roll, insertion, head = joints
-  turn = port.mat @ _about(0, pitch) @ _about(1, -yaw) @ _about(2, -roll)
-  return forward(port, (pitch, yaw, insertion)), turn @ _about(0, -optics) @ _about(2, head)
+  turn = port.mat @ about(0, pitch) @ about(1, -yaw) @ about(2, -roll)
+  return forward(port, (pitch, yaw, insertion)), turn @ about(0, -optics) @ about(2, head)
 
 
 def level(mat: np.ndarray) -> float:
@@ -69,7 +69,7 @@ def show(port: Trocar, place, far: float, side, optics: float = OPTICS) -> Pose:
   depth = reach * math.cos(lean) - far * math.cos(optics)
   lens = port.pos + depth * (math.cos(lean) * along + math.sin(lean) * aside)
   pitch, yaw, insertion = inverse(port, lens, check=False)
-  straight = port.mat @ _about(0, pitch) @ _about(1, -yaw)
+  straight = port.mat @ about(0, pitch) @ about(1, -yaw)
   x, y, _ = straight.T @ (place - lens)
   roll = math.atan2(-x, -y) if optics else 0.0
   joints = Pose(pitch, yaw, roll, insertion, 0.0)
@@ -85,7 +85,7 @@ def behind(pos, mat, depth: float, optics: float = OPTICS) -> Trocar:
     depth: from port to lens, with the insertion zero
     optics: angle between shaft and view
   """
-  turn = np.asarray(mat) @ _about(0, optics)
+  turn = np.asarray(mat) @ about(0, optics)
   return Trocar(NAME, np.asarray(pos) + depth * turn[:, 2], turn, depth)
 
 
@@ -104,19 +104,3 @@ def stand(model: mujoco.MjModel, camera: int, lamp: int, row) -> None:
     mujoco.mju_quat2Mat(axes, np.asarray(row[3:], float))
     axes = axes.reshape(3, 3)
     model.light_pos[lamp], model.light_dir[lamp] = row[:3] + BESIDE * axes[:, 0], -axes[:, 2]
-
-
-def orientation(mat: np.ndarray) -> np.ndarray:
-  """Returns the quaternion of a matrix, w x y z."""
-  quat = np.zeros(4)
-  mujoco.mju_mat2Quat(quat, np.ascontiguousarray(mat).ravel())
-  return quat
-
-
-def _about(axis: int, angle: float) -> np.ndarray:
-  """Returns the rotation about an axis."""
-  out, (j, k) = np.eye(3), ((axis + 1) % 3, (axis + 2) % 3)
-  out[j, j] = out[k, k] = math.cos(angle)
-  out[k, j] = math.sin(angle)
-  out[j, k] = -out[k, j]
-  return out

@@ -12,6 +12,7 @@ which does not depend on roll. Lengths are in m, angles in rad.
 """
 
 import dataclasses
+import math
 import pathlib
 
 import mujoco
@@ -183,3 +184,19 @@ def inverse(trocar: Trocar, tip_pos, check: bool = True) -> np.ndarray:
       f"{tip_pos[index[:-1]]}, expected a number in [{low[index[-1]]:g}, {high[index[-1]]:g}]"
     )
   return np.clip(joints, low, high)
+
+
+def orientation(mat: np.ndarray) -> np.ndarray:
+  """Returns the quaternion of a matrix, w x y z."""
+  quat = np.zeros(4)
+  mujoco.mju_mat2Quat(quat, np.ascontiguousarray(mat).ravel())
+  return quat
+
+
+def about(axis: int, angle: float) -> np.ndarray:
+  """Returns the rotation about an axis by an angle [rad]."""
+  out, (j, k) = np.eye(3), ((axis + 1) % 3, (axis + 2) % 3)
+  out[j, j] = out[k, k] = math.cos(angle)
+  out[k, j] = math.sin(angle)
+  out[j, k] = -out[k, j]
+  return out

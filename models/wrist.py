@@ -18,7 +18,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .trocar import WRIST, Trocar
+from .trocar import WRIST, Trocar, about
 
 INSERTION = 0.1163  # what the dVRK adds to `insertion`
 _SINGULAR = 1e-9  # how near the second axis may be to the line through the trocar
@@ -38,13 +38,13 @@ def forward(port: Trocar, joints: Joints) -> tuple[np.ndarray, np.ndarray]:
     joints: pitch, yaw, roll, insertion, and those of the wrist, if it has one  (4,) or (6,)
   """
   pitch, yaw, roll, insertion = (float(q) for q in joints[:4])
-  turn = port.mat @ _about(0, pitch) @ _about(1, -yaw)
+  turn = port.mat @ about(0, pitch) @ about(1, -yaw)
   pos = port.pos - (port.depth - sum(port.wrist) + insertion) * turn[:, 2]
-  turn = turn @ _about(2, -roll)
+  turn = turn @ about(2, -roll)
   if port.wrist:
-    turn = turn @ _about(1, -joints[4])
+    turn = turn @ about(1, -joints[4])
     pos = pos - port.wrist[0] * turn[:, 2]
-    turn = turn @ _about(0, joints[5]) @ _about(2, -math.pi / 2)
+    turn = turn @ about(0, joints[5]) @ about(2, -math.pi / 2)
     pos = pos - port.wrist[1] * turn[:, 2]
   return pos, turn
 
@@ -119,12 +119,3 @@ def _within(port: Trocar, joints: list[float]) -> np.ndarray:
   order = [0, 1, 3, 2, 4, 5][: len(joints)]
   limits = port.ranges[order].tolist()
   return np.array([min(max(q, a), b) for q, (a, b) in zip(joints, limits, strict=True)])
-
-
-def _about(axis: int, angle: float) -> np.ndarray:
-  """Returns the rotation about an axis."""
-  out, (j, k) = np.eye(3), ((axis + 1) % 3, (axis + 2) % 3)
-  out[j, j] = out[k, k] = math.cos(angle)
-  out[k, j] = math.sin(angle)
-  out[j, k] = -out[k, j]
-  return out

@@ -28,7 +28,7 @@ from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import numpy as np
-from palpate.models import laparoscope, trocar, wrist
+from palpate.models import trocar, wrist
 
 from ..learn import policy
 from .environment import Environment
@@ -285,7 +285,7 @@ class Performer:
       tip = tip + self.style.tremor * math.sqrt(2 / len(_TREMOR_HZ)) * wave.sum(axis=0)
     bent = bool(self.trocar.wrist)
     if self.hand.handle:
-      row = [*tip, *laparoscope.orientation(turn)] if bent else self.hand.handle_row(tip, roll)
+      row = [*tip, *trocar.orientation(turn)] if bent else self.hand.handle_row(tip, roll)
       return np.concatenate([row, extra])
     if bent:
       goal = wrist.inverse(self.trocar, tip, turn, float(self.hand.drive_targets()[2]))

@@ -279,7 +279,7 @@ def _look(spec: mujoco.MjSpec, scene: Scene, center: np.ndarray) -> None:
   """Puts the camera on a laparoscope, whose picture is level where its joints are zero."""
   prefix = f"{laparoscope.NAME}/"
   back = np.asarray(scene.port) / np.linalg.norm(scene.port)
-  quat = laparoscope.orientation(np.column_stack([*_upright(back), back]))
+  quat = trocar.orientation(np.column_stack([*_upright(back), back]))
   trocar.attach(spec, laparoscope.NAME, prefix, center + scene.port, quat, scene.handle)
   spec.body(f"{prefix}eye").quat = laparoscope.turned(scene.optics)
   spec.camera(f"{prefix}camera").name = CAMERA

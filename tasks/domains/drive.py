@@ -24,7 +24,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import palpate
-from palpate.models import laparoscope, wrist
+from palpate.models import trocar, wrist
 
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
@@ -139,7 +139,7 @@ class Drive(Task):
     place = place + np.array([0.0, 0.0, _OVER]) + self.random.uniform(-0.003, 0.003, 3)
     lean = self.random.uniform(-0.15, 0.15, 3)
     mat = about(0, lean[0]) @ about(1, lean[1]) @ about(2, lean[2]) @ mat
-    self.joints = {"needle": np.concatenate([place, laparoscope.orientation(mat)])}
+    self.joints = {"needle": np.concatenate([place, trocar.orientation(mat)])}
     held = _HELD_AT + self.random.uniform(-0.1, 0.1)
     port = physics.trocar()
     physics.set_joints(wrist.inverse(port, *grasp(port, place, mat, held)))

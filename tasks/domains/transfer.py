@@ -28,7 +28,7 @@ import mujoco
 import numpy as np
 import palpate
 import warp as wp
-from palpate.models import laparoscope, wrist
+from palpate.models import trocar, wrist
 from palpate.tissue.types import Array
 
 from ..core.base import Physics, Task
@@ -316,7 +316,7 @@ class Transfer(Task):
     place = place + self.random.uniform(-0.006, 0.006, 3) - np.array([0.006, 0.0, 0.0])
     lean = self.random.uniform(-0.2, 0.2, 3)
     mat = about(0, lean[0]) @ about(1, lean[1]) @ about(2, lean[2]) @ mat
-    self.joints = {"needle": np.concatenate([place, laparoscope.orientation(mat)])}
+    self.joints = {"needle": np.concatenate([place, trocar.orientation(mat)])}
     held = -_TAKES + self.random.uniform(-0.15, 0.15)
     first, second = physics.hands
     for hand, (pos, turn) in (
@@ -494,8 +494,7 @@ def _do(p: Performer, hand: Performer, script: Script) -> Script:
 
 def between(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
   """Returns a frame a share of the way from one to another."""
-  quat, spin = np.zeros(4), np.zeros(3)
-  mujoco.mju_mat2Quat(quat, np.ascontiguousarray(a.T @ b).ravel())
+  quat, spin = trocar.orientation(a.T @ b), np.zeros(3)
   mujoco.mju_quat2Vel(spin, quat, 1.0)
   angle = float(np.linalg.norm(spin))
   if angle < 1e-9:

@@ -184,7 +184,7 @@ class Practice:
       self.pace.now, 1 / FPS, tip, self.organ.xpos
     )
     if moved and self.scope is not None:
-      row = np.concatenate([self.scope.pos, laparoscope.orientation(self.scope.mat)])
+      row = np.concatenate([self.scope.pos, trocar.orientation(self.scope.mat)])
       laparoscope.stand(self.model, self._eye, self._lamp, row)
       for link in self.links:
         link.turn(self.scope.mat)
@@ -294,6 +294,4 @@ def own(path: pathlib.Path, instruments: Sequence[str]) -> tuple[mj.MjSpec, str]
 def _turn(x: np.ndarray, y: np.ndarray) -> np.ndarray:
   """Returns the orientation whose first axes go these ways, w x y z."""
   x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
-  quat = np.zeros(4)
-  mj.mju_mat2Quat(quat, np.stack([x, y, np.cross(x, y)], axis=1).ravel())
-  return quat
+  return trocar.orientation(np.stack([x, y, np.cross(x, y)], axis=1))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from palpate.models import laparoscope
+from palpate.models import trocar
 from palpate.models.handle import Shaft, Wrist
 from palpate.tasks.core import episode
 from palpate.tasks.core.handle import ROW
@@ -170,7 +170,7 @@ class Session:
     physics, scope = self.env.physics, self.scope
     dt = self.env.control_timestep()
     if scope is not None and scope.advance(self.pace.now, dt, physics.tip_pos(), physics.nodes()):
-      physics.look_from(np.concatenate([scope.pos, laparoscope.orientation(scope.mat)]))
+      physics.look_from(np.concatenate([scope.pos, trocar.orientation(scope.mat)]))
     now = axes(physics.model.ptr, physics.data.ptr)
     if np.abs(now - self._turned).max() > _TURNED:
       self._turned = now
