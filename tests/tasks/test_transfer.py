@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from palpate.models import laparoscope
+from palpate.models import trocar
 from palpate.tasks import suite
 from palpate.tasks.core import performer
 from palpate.tasks.domains import transfer
@@ -18,7 +18,7 @@ def turn(env, angles, shift=0.0):
   task, out = env.task, []
   for angle in angles:
     pos, mat = transfer.posed(task, 0, angle)
-    row = np.concatenate([pos + np.array([0.0, 0.0, shift]), laparoscope.orientation(mat)])
+    row = np.concatenate([pos + np.array([0.0, 0.0, shift]), trocar.orientation(mat)])
     env.physics.put({"needle": row}, {})
     transfer.advance(env.physics, task)
     out.append((task.through, task.passed))
