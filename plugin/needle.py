@@ -13,13 +13,13 @@ ARCS = {"1/4": 0.25, "3/8": 0.375, "1/2": 0.5, "5/8": 0.625}  # of a circle
 # Width of the slit that a tip opens over the diameter: the edges of a cutting one are as wide, and
 # a cone tears a crack of about half (Shergold and Fleck 2004, doi:10.1098/rspa.2004.1315).
 TIPS = {"taper": 0.5, "cutting": 1.0}
-# Thirty times that of steel: MuJoCo's contacts are as stiff as what they hold is heavy, and jaws
-# would close on 0.07 g as on nothing. Its weight, 0.02 N, is still none of a suture's forces.
-_MASS = 0.002  # [kg]
+_STEEL = 7800.0  # density [kg/m^3]
 _CAPSULES = 16  # of the arc
 _POINT = (0.7, 0.35)  # radius of the last two over that of the others
 _NEAR = 1e-4  # from the swage to the first node of a thread [m]
-_FIRM = (0.005, 1.0)  # solref of what joins a thread
+# What joins a thread: MuJoCo's equalities are as firm as what they hold is heavy, unless their
+# impedance is near to 1.
+_FIRM = {"solref": (0.005, 1.0), "solimp": (0.999, 0.9999, 0.001, 0.5, 2.0)}
 _RGBA = (0.75, 0.77, 0.8, 1.0)
 
 
@@ -35,7 +35,7 @@ def add_needle(
   parent: mujoco.MjsBody | str | None = None,
   pos: Sequence[float] = (0.0, 0.0, 0.0),
   quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
-  mass: float = _MASS,
+  mass: float | None = None,
   rgba: Sequence[float] = _RGBA,
   contact: Mapping[str, object] | None = None,
 ) -> mujoco.MjsBody:
@@ -59,7 +59,7 @@ def add_needle(
     parent: what it is fixed in; None for the world, in which it is free
     pos: of the circle's centre in the parent [m]
     quat: orientation in the parent
-    mass: [kg]; some 0.07 g are real, but too light to be held by MuJoCo's contacts
+    mass: [kg]; None for that of the wire in steel, 0.08 g as it is
     rgba: colour
     contact: attributes of the geoms that are not as usual: condim, friction, contype, ...
 
@@ -72,6 +72,8 @@ def add_needle(
   for what, value, known in (("arc", arc, ARCS), ("tip", tip, TIPS)):
     if value not in known:
       raise ValueError(f"needle {name!r}: {what} is {value!r}, expected one of {', '.join(known)}")
+  if mass is None:
+    mass = _STEEL * np.pi / 4 * diameter**2 * length
   for what, value, most in (("length", length, 1.0), ("diameter", diameter, length / 4),
                             ("mass", mass, np.inf)):  # fmt: skip
     if not 0 < value < most:
@@ -106,7 +108,7 @@ def add_needle(
     data = [*points[0], *np.zeros(mujoco.mjNEQDATA - 3)]
     spec.add_equality(
       name=f"{name}_{thread}", type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY,
-      name1=name, name2=f"{thread}_0", solref=_FIRM, data=data,
+      name1=name, name2=f"{thread}_0", data=data, **_FIRM,
     )  # fmt: skip
   return body
 

@@ -35,7 +35,7 @@ def test_its_arc_is_a_part_of_a_circle(arc, share):
   assert along[1] * np.cross(swage.xpos, tip.xpos)[2] >= -1e-12
   middle = circle * np.sin(np.pi * share) / (np.pi * share)  # of an arc's mass
   assert model.body("needle").ipos == pytest.approx([middle, 0, 0], abs=0.01 * middle)
-  assert model.body("needle").mass[0] == pytest.approx(0.002)
+  assert model.body("needle").mass[0] == pytest.approx(7800 * np.pi / 4 * DIAMETER**2 * LENGTH)
   assert model.site("needle_tip").size[0] == pytest.approx(DIAMETER / 2)
 
 

@@ -74,7 +74,7 @@ def scene(
     data[6:11] = *quat, 1
     spec.add_equality(
       name="grip", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="hand",
-      name2="needle", solref=[0.004, 1], data=data,
+      name2="needle", solref=[0.004, 1], solimp=[0.999, 0.9999, 0.001, 0.5, 2], data=data,
     )  # fmt: skip
   else:
     palpate.add_needle(spec, length=LENGTH, quat=quat, parent="hand", thread=thread)

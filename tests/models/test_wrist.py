@@ -162,7 +162,7 @@ def _holding(angle, lean):
   out = np.cos(lean) * mat[:, 0] + np.sin(lean) * np.cross(along, mat[:, 0])
   quat, place = np.zeros(4), 0.0036 * mat[:, 2]
   mujoco.mju_mat2Quat(quat, np.column_stack([out, along, np.cross(out, along)]).ravel())
-  palpate.add_needle(spec, pos=place - ARC * out, quat=quat, mass=7e-5)  # as steel weighs
+  palpate.add_needle(spec, pos=place - ARC * out, quat=quat)
   model = spec.compile()
   data = mujoco.MjData(model)
   for side in ("left", "right"):
