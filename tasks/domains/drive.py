@@ -5,10 +5,10 @@ the wall along its own circle, and out through the second one, 12 mm on. The wal
 tip until it gives way, then the needle slides through its hole, see `palpate.add_organ(needles=)`.
 
 Own observations, in the world: `target` (3,), from the needle's tip to the mark whose turn it is
-[m]; `circle` (3,), axis of the needle's circle [-]; `middle` (3,), from the first mark to the
-middle of that circle [m]; `pierced` (1,), holes that the needle has made in their turn [-]; `out`
-(1,), how far the tip has come out, as a share of what is wanted [-]; `holds` (1,), whether the
-jaws hold the needle.
+[m]; `way` (3,), from the first mark to the second one [-]; `circle` (3,), axis of the needle's
+circle [-]; `middle` (3,), from the first mark to the middle of that circle [m]; `pierced` (1,),
+holes that the needle has made in their turn [-]; `out` (1,), how far the tip has come out, as a
+share of what is wanted [-]; `holds` (1,), whether the jaws hold the needle.
 
 Progress: 0.3 * closeness of the tip to the first mark; 0.4 + 0.2 * closeness to the second one once
 it is in; 0.7 + 0.3 * out once it is through both. Success: both holes within the tolerance of their
@@ -200,6 +200,7 @@ class Drive(Task):
     pos, mat = needle(physics)
     return {
       "target": self.marks[min(self.holes, 1)] - arc(physics, 1.0),
+      "way": self.way.copy(),
       "circle": mat[:, 2],
       "middle": pos - self.marks[0],
       "pierced": np.array([float(self.holes)]),
