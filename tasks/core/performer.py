@@ -347,10 +347,15 @@ class Performer:
     """Moves the tip along such a line at once and straight: a stroke that is known by heart."""
     start, speed = self.tip.copy(), speed * self.style.speed
     steps = max(2, round(float(np.linalg.norm(goal - start)) / speed / self.dt))
-    for k in range(1, steps + 1):
-      s = k / steps
-      self.tip = start + (goal - start) * (10 * s**3 - 15 * s**4 + 6 * s**5)
+    for share in self.shares(steps):
+      self.tip = start + (goal - start) * share
       yield self.step()
+
+  def shares(self, steps: int) -> Iterator[float]:
+    """Yields the shares of its way that a movement has come after each of so many steps."""
+    for k in range(1, steps + 1):
+      t = k / steps
+      yield 10 * t**3 - 15 * t**4 + 6 * t**5
 
   def push(self, force: float, along: np.ndarray, until: Callable[[], bool], most=5.0) -> Script:
     """Presses with a force [N] along a direction until a condition or for `most` seconds."""

@@ -505,19 +505,12 @@ def between(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
   return a @ mat.reshape(3, 3)
 
 
-def eased(steps: int) -> Iterator[float]:
-  """Yields shares of a minimum-jerk movement of so many steps."""
-  for k in range(1, steps + 1):
-    t = k / steps
-    yield 10 * t**3 - 15 * t**4 + 6 * t**5
-
-
 def move_tip(p: Performer, goal: np.ndarray, turn: np.ndarray) -> Script:
   """Moves the tip of a hand to a pose."""
   start, before = p.tip.copy(), p.turn.copy()
   angle = math.acos(float(np.clip((np.trace(before.T @ turn) - 1) / 2, -1.0, 1.0)))
   far = max(float(np.linalg.norm(goal - start)) / _SPEED, angle / _TURN) / p.style.speed
-  for t in eased(max(2, round(far / p.dt))):
+  for t in p.shares(max(2, round(far / p.dt))):
     p.tip, p.turn = start + t * (goal - start), between(before, turn, t)
     yield p.step()
 
@@ -537,7 +530,7 @@ def carry(p: Performer, path: Any, angle: float | None = None) -> Script:
   far = float(np.linalg.norm(end - pos)) / _SPEED
   spun = math.acos(float(np.clip((np.trace(mat.T @ turn) - 1) / 2, -1.0, 1.0)))
   spun = abs(angle) if angle is not None else spun
-  for t in eased(max(2, round(max(far, spun / _TURN) / p.style.speed / p.dt))):
+  for t in p.shares(max(2, round(max(far, spun / _TURN) / p.style.speed / p.dt))):
     if angle is None:
       place, now_turned = pos + t * (end - pos), between(mat, turn, t)
     else:  # what it is off the path at the start is made up on the way

@@ -9,7 +9,7 @@ taught where most is to be learned.
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -73,13 +73,10 @@ class Teacher(Performer):
     before, self._before = self._before, goal
     return self.hand.drive_targets() + goal - before + _BACK * (before - self.hand.drive_targets())
 
-  def line(self, goal: np.ndarray, speed: float) -> Script:
-    """Moves the tip along a straight line."""
-    start, way = self.tip, np.asarray(goal, float) - self.tip
-    steps = max(1, round(float(np.linalg.norm(way)) / speed / self.dt))
+  def shares(self, steps: int) -> Iterator[float]:
+    """Yields the shares of its way that an even movement has come after each of so many steps."""
     for k in range(1, steps + 1):
-      self.tip = start + way * k / steps
-      yield self.step()
+      yield k / steps
 
   def wait(self, duration: float) -> Script:
     """Holds still where the exercise is over."""
