@@ -62,8 +62,9 @@ def split(name: str) -> tuple[str, str]:
 def ends(name: str) -> dict[str, float]:
   """Returns at which value of a metric an exercise ends, and fails [SI]."""
   entry = registry.ENTRIES["/".join(split(name))]
-  damage = float(entry.make(name=entry.name).damage)
-  return {"time": entry.time_limit, "peak_force": damage, "peak_grip": damage}
+  task = entry.make(name=entry.name)
+  grip = {"peak_grip": float(task.damage)} if task.grips else {}
+  return {"time": entry.time_limit, "peak_force": float(task.damage), **grip}
 
 
 def by_hand(name: str) -> str:

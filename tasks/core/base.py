@@ -182,6 +182,11 @@ class Task(engine.Task):
     return jawed(self.prefix)
 
   @property
+  def grips(self) -> bool:
+    """Whether the jaws grip tissue: those of an instrument with a wrist hold a needle."""
+    return self.jaws and trocar.kind(self.prefix) not in trocar.WRISTED
+
+  @property
   def components(self) -> tuple[str, ...]:
     """Names of the action's components."""
     other = self.second.replace("/", "_")
@@ -462,7 +467,7 @@ class Task(engine.Task):
     """Returns the limits that the metrics need."""
     return Settings(
       force_limit=self.force_limit,
-      grip_limit=self.force_limit if self.jaws else None,
+      grip_limit=self.force_limit if self.grips else None,
       tip_cutoff=None,  # the simulation's positions are exact
       reference_length=self.reference_length(),
       contact_force=0.02,

@@ -216,10 +216,6 @@ class Drive(Task):
     """Returns the needle's pull on the wall, and how deep it went."""
     return {"traction": self.pull, "bite": self.deepest}
 
-  def settings(self) -> Any:
-    """Returns the limits of the metrics: none of the grip, which is a needle's."""
-    return dataclasses.replace(super().settings(), grip_limit=None)
-
   def instruct(self, physics: Physics) -> str:
     """Says what is next."""
     return (

@@ -345,10 +345,6 @@ class Transfer(Task):
       "regrasped": self.regrasps, "ring_time": self.scraping, "ring_force": self.worst
     }  # fmt: skip
 
-  def settings(self) -> Any:
-    """Returns the limits of the metrics: none of the grip, which is a needle's."""
-    return dataclasses.replace(super().settings(), grip_limit=None)
-
   def label(self, kind: str) -> str:
     """Returns what a drop is."""
     return "needle" if kind == "drop" else super().label(kind)

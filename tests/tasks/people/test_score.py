@@ -166,6 +166,7 @@ def test_a_limit_is_below_what_ends_an_exercise_and_below_all_of_a_share():
   limits = _limits(make_reference(panel, "touch", 0, ends))
   assert limits == {"time": pytest.approx(10.8), "idle_share": 90, "peak_force": pytest.approx(1.1)}
   assert suite.ends("touch/easy")["time"] == 10 and suite.ends("grasp/hard")["peak_grip"] == 6
+  assert "peak_grip" not in suite.ends("suture/drive_easy")  # of a needle
 
 
 def test_movements_are_not_scored_where_some_of_the_panel_are_too_slow_for_any():
