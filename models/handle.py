@@ -151,11 +151,8 @@ class Tip:
   ) -> None:
     """Sets the pose; arguments as of `Handle.move`, velocities are not used."""
     self.pos, self.quat = np.array(pos), self.quat if quat is None else np.array(quat)
-    mat = np.zeros(9)
-    mujoco.mju_quat2Mat(mat, self.quat)
     roll = float(self._ctrl[self._drives[2]])
-    joints = wrist.inverse(self.port, self.pos, mat.reshape(3, 3), roll)
-    self._ctrl[self._drives] = joints
+    self._ctrl[self._drives] = wrist.inverse(self.port, self.pos, ports.matrix(self.quat), roll)
 
   def wrench(self) -> tuple[float, float, float, float, float, float]:
     """Returns zeros, see `Handle.wrench`."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from .trocar import Trocar, about, forward, inverse
+from .trocar import Trocar, about, forward, inverse, matrix
 
 NAME = "laparoscope"
 OPTICS = math.radians(30.0)
@@ -100,7 +100,5 @@ def stand(model: mujoco.MjModel, camera: int, lamp: int, row) -> None:
   """
   model.cam_pos[camera], model.cam_quat[camera] = row[:3], row[3:]
   if lamp >= 0:
-    axes = np.zeros(9)
-    mujoco.mju_quat2Mat(axes, np.asarray(row[3:], float))
-    axes = axes.reshape(3, 3)
+    axes = matrix(row[3:])
     model.light_pos[lamp], model.light_dir[lamp] = row[:3] + BESIDE * axes[:, 0], -axes[:, 2]

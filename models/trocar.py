@@ -131,9 +131,7 @@ def trocar(model: mujoco.MjModel, prefix: str = "") -> Trocar:
     mujoco.mju_mulQuat(turned, model.body_quat[body], quat)
     pos, quat = moved + model.body_pos[body], turned
     body = int(model.body_parentid[body])
-  mat = np.zeros(9)
-  mujoco.mju_quat2Mat(mat, quat)
-  return Trocar(prefix, pos, mat.reshape(3, 3), float(depth), ranges, wrist)
+  return Trocar(prefix, pos, matrix(quat), float(depth), ranges, wrist)
 
 
 def forward(trocar: Trocar, joints) -> np.ndarray:
@@ -191,6 +189,13 @@ def orientation(mat: np.ndarray) -> np.ndarray:
   quat = np.zeros(4)
   mujoco.mju_mat2Quat(quat, np.ascontiguousarray(mat).ravel())
   return quat
+
+
+def matrix(quat) -> np.ndarray:
+  """Returns the matrix of a quaternion, w x y z."""
+  mat = np.zeros(9)
+  mujoco.mju_quat2Mat(mat, np.asarray(quat, float))
+  return mat.reshape(3, 3)
 
 
 def about(axis: int, angle: float) -> np.ndarray:

@@ -24,27 +24,26 @@ from typing import Any
 import mujoco
 import numpy as np
 import palpate
-from palpate.models import trocar, wrist
 
-from ..core.base import Physics, Task
+from ..core.base import Physics
 from ..core.performer import Performer, Script
-from ..core.rules import closeness, pinch
+from ..core.rules import closeness
 from ..core.scenes import Scene
 from ..registry import exercise
 from . import sheet
-from .transfer import (
-  HELD,
+from .needles import (
   LOST,
   MEETS,
-  NEAR,
   PIECES,
   RADIUS,
-  about,
+  Needlework,
+  Pose,
   arc,
-  away,
+  arrive,
   carry,
-  grasp,
+  grasped,
   needle,
+  right_grasp,
 )
 
 BITE = 0.012  # between the marks [m]; FLS: 5 mm on either side of a slit
@@ -58,7 +57,6 @@ FIELD = Scene(
 )
 _MASS, _SLOTS = 0.004, 120  # of the wall [kg], and of its window
 _HELD_AT = math.radians(-65.0)  # along the arc from its middle [rad]
-_OPENING = 0.056  # of each jaw, just off the wire [rad]
 # Of the expert: over the wall [m], the tip's way out at the end [m], and how far it turns at once
 # [rad].
 _OVER, _MORE, _LOOK = 0.012, 0.0015, 0.6
@@ -83,10 +81,9 @@ def hard(**kwargs):
   return Drive(FIELD, **kwargs)
 
 
-class Drive(Task):
+class Drive(Needlework):
   """Drive a needle through two marks."""
 
-  watch = ("drop", "unintended_contact")
   targets = 2
 
   def __init__(
@@ -117,9 +114,7 @@ class Drive(Task):
     """Returns the scene: a wall in a frame, and the needle."""
     law = {"needles": f"needle {self.tough:g} {FRICTION:g}"}
     spec = sheet.stretched(self._scene(variant), WALL | law, _MASS, slots=_SLOTS)
-    for geom in spec.geoms:
-      if geom.parent.name.startswith(self.prefix) and geom.contype & 1:
-        geom.contype, geom.conaffinity = geom.contype | MEETS, geom.conaffinity | MEETS
+    self.meet(spec)
     apart = (0.1, 0.0, -0.05)  # until an episode begins
     meets = {"contype": 1 | MEETS, "conaffinity": 1 | MEETS}
     palpate.add_needle(spec, pos=apart, quat=(1, 1, 0, 0), contact=meets)
@@ -137,16 +132,10 @@ class Drive(Task):
     self.marks = middle + np.outer([-0.5, 0.5], BITE * self.way)
     place, mat = posed(self, -self.half - math.radians(20.0))
     place = place + np.array([0.0, 0.0, _OVER]) + self.random.uniform(-0.003, 0.003, 3)
-    lean = self.random.uniform(-0.15, 0.15, 3)
-    mat = about(0, lean[0]) @ about(1, lean[1]) @ about(2, lean[2]) @ mat
-    self.joints = {"needle": np.concatenate([place, trocar.orientation(mat)])}
-    held = _HELD_AT + self.random.uniform(-0.1, 0.1)
-    port = physics.trocar()
-    physics.set_joints(wrist.inverse(port, *grasp(port, place, mat, held)))
-    self.joints |= {f"{self.prefix}jaw_{side}": np.array([_OPENING]) for side in ("left", "right")}
-    self.holes, self.misses, self.loose, self.holds = 0, [0.0, 0.0], 0.0, 1.0
+    tip = self.take_up(physics, (place, mat), _HELD_AT, lean=0.15, along=0.1)
+    self.holes, self.misses = 0, [0.0, 0.0]
     self.out = self.deepest = self.pull = 0.0
-    self.start0 = float(np.linalg.norm(place + RADIUS * mat[:, 1] - self.marks[0]))
+    self.start0 = float(np.linalg.norm(tip - self.marks[0]))
 
   @property
   def half(self) -> float:
@@ -155,10 +144,7 @@ class Drive(Task):
 
   def advance(self, physics: Physics) -> float:
     """Follows the needle through the wall."""
-    held = pinch(physics) > HELD and away(physics, physics.tip_pos()) < NEAR
-    if self.holds and not held:
-      self.event(physics, "drop", label="needle")
-    self.holds, self.loose = float(held), 0.0 if held else self.loose + self.control_timestep
+    grasped(physics, self, right_grasp(physics), 0.0)
     (found,) = physics.organ.needles
     self.pull = float(np.linalg.norm(found.force))
     for k, hole in enumerate(found.holes[:2]):
@@ -205,12 +191,8 @@ class Drive(Task):
       "middle": pos - self.marks[0],
       "pierced": np.array([float(self.holes)]),
       "out": np.array([self.out]),
-      "holds": np.array([self.holds]),
+      "holds": np.array([self.right_holds]),
     }
-
-  def still(self, hand: int) -> np.ndarray:
-    """Returns what keeps the jaws closed on the needle."""
-    return np.array([-1.0 if self.holds else 0.15])
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns the needle's pull on the wall, and how deep it went."""
@@ -231,10 +213,10 @@ class Drive(Task):
     if not self.holes:
       over = posed(self, start)
       yield from carry(p, lambda t: (over[0] + np.array([0.0, 0.0, 0.006]), over[1]))
-      yield from _arrive(p)
+      yield from arrive(p)
       yield from carry(p, lambda t: over)
     while True:  # looking again how the needle lies in the jaws
-      yield from _arrive(p)
+      yield from arrive(p)
       now = tip_angle(self, p.physics)
       if now > end - 0.01:
         return
@@ -242,18 +224,12 @@ class Drive(Task):
       yield from carry(p, functools.partial(_turned, self, now, stop), stop - now)
 
 
-def _turned(task: Drive, start: float, stop: float, t: float) -> tuple[np.ndarray, np.ndarray]:
+def _turned(task: Drive, start: float, stop: float, t: float) -> Pose:
   """Returns the pose of a needle that is a share of the way between two angles of its tip."""
   return posed(task, start + t * (stop - start))
 
 
-def _arrive(p: Performer) -> Script:
-  """Waits for a hand that is late."""
-  if p.style.reaction:
-    yield from p.wait(p.style.reaction + 0.1)
-
-
-def posed(task: Drive, tip: float) -> tuple[np.ndarray, np.ndarray]:
+def posed(task: Drive, tip: float) -> Pose:
   """Returns the needle's pose with its circle through both marks, by the angle of its tip.
 
   The angle is that at the middle of the circle, from straight down towards the second mark [rad].

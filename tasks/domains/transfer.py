@@ -21,17 +21,16 @@ damage limit, or the time limit.
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator
 from typing import Annotated, Any
 
 import mujoco
 import numpy as np
 import palpate
 import warp as wp
-from palpate.models import trocar, wrist
+from palpate.models import wrist
 from palpate.tissue.types import Array
 
-from ..core.base import Physics, Task
+from ..core.base import Physics
 from ..core.performer import Performer, Script
 from ..core.rules import (
   HIDDEN,
@@ -44,29 +43,41 @@ from ..core.rules import (
   Vector,
   closeness,
   dot,
-  drop,
   length,
   needle_place,
-  other_pinch,
   other_tip,
-  pinch,
   scraped,
-  sine,
   tip,
   vector,
 )
 from ..core.scenes import Scene
 from ..registry import exercise
+from .needles import (
+  LOST,
+  MEETS,
+  PIECES,
+  QUARTER,
+  RADIUS,
+  WIDE,
+  Hands,
+  Needlework,
+  Pose,
+  about,
+  arc,
+  carry,
+  grasp,
+  grasped,
+  jaws,
+  left_grasp,
+  move_tip,
+  needle,
+  one,
+  right_grasp,
+)
 
-RADIUS = 0.026 / math.pi  # of the needle's circle [m]
-QUARTER = 0.5 * math.pi
-PIECES = 16  # that the needle is looked at in
-HELD, NEAR = 1.0, 0.008  # of jaws that hold the needle: least force [N], farthest from it [m]
-LOST = 0.5  # how long nobody may hold it [s]
 TAKEN = 25.0 / 180.0  # where it is to be taken, from its first end, as a share of it
 TUBE, SIDES = 0.0008, 12  # of a ring: radius of its wire [m], and straight pieces
 MASS = 7e-5  # of a needle of steel [kg]
-MEETS = 8  # bit of what the needle meets: not the organ
 # Contacts of a needle of 0.07 g with a ring: about 3 N/mm, with the usual ones it would go through.
 FIRM = {"solref": (0.005, 1.0), "solimp": (0.999, 0.999, 1e-3, 0.5, 2.0), "solmix": 1e3}
 FIELD = Scene(
@@ -75,12 +86,10 @@ FIELD = Scene(
 )  # fmt: skip
 _HIGH = 0.03  # of the rings over the organ [m]
 _APART = 0.034  # of rings: needle and wrist have room between them [m]
-_BITE = 0.0036  # from the tip of the jaws to the wire between them [m]
-_OPENING = 0.056  # of each jaw, just off the wire [rad]
 # Of the expert, polar angles about a ring's frame, and along the arc from its middle [rad]: the
 # turn that an end enters with, that of the handing over, and what is behind the ring in the end.
 _ENTERS, _HANDS, _TAKES = math.radians(20.0), math.radians(20.0), math.radians(65.0)
-_BACK, _RISE, _WIDE, _TURN, _SPEED = 0.014, 0.016, 0.15, 1.2, 0.03
+_BACK, _RISE = 0.014, 0.016  # out of a ring, and off the needle [m]
 
 
 @exercise("needle/transfer_easy", 25, "easy", "bimanual")
@@ -103,22 +112,17 @@ def hard(**kwargs):
   return Transfer(FIELD, **kwargs)
 
 
-class State:
+class State(Hands):
   """State of a world."""
 
   size: float  # of the rings: inner radius [m]
   middles: Annotated[Any, Array(wp.vec3, ("targets",))]  # of the rings [m]
   ways: Annotated[Any, Array(wp.vec3, ("targets",))]  # through them from right to left
-  control_timestep: float  # [s]
   done: int
   error0: float  # of the first end at the start [m]
   entered: int  # 1 where the needle is in the ring, first end first, -1 the other way round
   passed: bool  # whether all of the needle is through
-  loose: float  # how long nobody has held it [s]
-  right_holds: float
-  left_holds: float
   through: float
-  regrasps: float
   scraping: float  # how long rings were touched [s]
   worst: float  # largest force on them [N]
   lead: Vector
@@ -129,12 +133,6 @@ class State:
 
 
 # The rules.
-
-
-def arc(s, share):
-  """Returns where a share of the needle from the swage on ends [m]."""
-  angle = 2.0 * QUARTER * (share - 0.5)
-  return needle_place(s, vector(RADIUS * sine(angle + QUARTER), RADIUS * sine(angle), 0.0))
 
 
 def now(o):
@@ -150,14 +148,6 @@ def back(o):
 def from_first(s, o, share):
   """Returns where a share of the needle from the end that goes first ends [m]."""
   return arc(s, share if back(o) else 1.0 - share)
-
-
-def away(s, place):
-  """Returns how far a place is from the needle's nearest piece [m]."""
-  least = float(1.0)  # noqa: UP018 - a variable to Warp
-  for k in range(PIECES + 1):
-    least = min(least, length(arc(s, float(k) / float(PIECES)) - place))
-  return least
 
 
 def crossing(s, o):
@@ -176,22 +166,9 @@ def crossing(s, o):
   return found
 
 
-def grasped(s, o):
-  """Follows which hands hold the needle."""
-  right = 1.0 if pinch(s) > HELD and away(s, tip(s)) < NEAR else 0.0
-  left = 1.0 if other_pinch(s) > HELD and away(s, other_tip(s)) < NEAR else 0.0
-  o.regrasps = o.regrasps + max(right - o.right_holds, 0.0) + max(left - o.left_holds, 0.0)
-  if right + left == 0.0 and o.right_holds + o.left_holds > 0.0:
-    drop(s, o)
-  o.right_holds = right
-  o.left_holds = left
-  o.loose = o.loose + o.control_timestep if right + left == 0.0 else 0.0
-  return o
-
-
 def advance(s, o):
   """Follows the needle: who holds it, what it scrapes on, and how far it is through the ring."""
-  o = grasped(s, o)
+  o = grasped(s, o, right_grasp(s), left_grasp(s))
   force = scraped(s)
   if force > 0.0:
     o.scraping = o.scraping + o.control_timestep
@@ -243,7 +220,7 @@ def mark(s, o, k):
   return o.middles[k] + vector(0.0, 0.0, o.size + 0.005), NOW if k == o.done else look
 
 
-class Transfer(Task):
+class Transfer(Needlework):
   """Pass a needle through rings, from hand to hand."""
 
   rules = Rules(
@@ -254,7 +231,6 @@ class Transfer(Task):
     metrics={"regrasps": "regrasps", "ring_contact": "scraping", "peak_ring_force": "worst"},
     mark=mark,
   )
-  watch = ("drop", "unintended_contact")
 
   def __init__(self, scene: Scene, random=None, *, rings: int, size: float, tilt: float, **kwargs):
     """Makes the task.
@@ -290,11 +266,7 @@ class Transfer(Task):
       name="scrape", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_XBODY,
       objname="rings", intprm=[2, 3, 1],
     )  # fmt: skip
-    for geom in spec.geoms:
-      own = geom.parent.name.startswith((self.prefix, self.second))
-      if own and geom.contype & 1:
-        geom.contype |= MEETS
-        geom.conaffinity |= MEETS
+    self.meet(spec)
     look = {"contype": MEETS, "conaffinity": MEETS}
     palpate.add_needle(spec, mass=MASS, contact=look)
     return spec
@@ -314,40 +286,23 @@ class Transfer(Task):
     }
     place, mat = entrance(self, 0)
     place = place + self.random.uniform(-0.006, 0.006, 3) - np.array([0.006, 0.0, 0.0])
-    lean = self.random.uniform(-0.2, 0.2, 3)
-    mat = about(0, lean[0]) @ about(1, lean[1]) @ about(2, lean[2]) @ mat
-    self.joints = {"needle": np.concatenate([place, trocar.orientation(mat)])}
-    held = -_TAKES + self.random.uniform(-0.15, 0.15)
-    first, second = physics.hands
-    for hand, (pos, turn) in (
-      (first, grasp(first.trocar(), place, mat, held)),
-      (second, park(self, second.trocar(), self.middles.mean(axis=0))),
-    ):
-      hand.set_joints(wrist.inverse(hand.trocar(), pos, turn))
-    self.joints |= {f"{self.prefix}jaw_{side}": np.array([_OPENING]) for side in ("left", "right")}
-    self.done, self.entered, self.passed, self.loose, self.through = 0, 0, False, 0.0, 0.0
-    self.right_holds, self.left_holds = 1.0, 0.0
-    self.regrasps = self.scraping = self.worst = 0.0
-    end = place + RADIUS * mat[:, 1]
+    _, second = physics.hands
+    end = self.take_up(physics, (place, mat), -_TAKES, lean=0.2, along=0.15)
+    port = second.trocar()
+    second.set_joints(wrist.inverse(port, *park(self, port, self.middles.mean(axis=0))))
+    self.done, self.entered, self.passed, self.through = 0, 0, False, 0.0
+    self.scraping = self.worst = 0.0
     self.error0 = float(np.linalg.norm(end - self.middles[0]))
 
   def mark_size(self, k: int) -> float:
     """Returns the radius of a mark [m]."""
     return 0.0015
 
-  def still(self, hand: int) -> np.ndarray:
-    """Returns what keeps the jaws closed on the needle, or open."""
-    return np.array([-1.0 if (self.left_holds if hand else self.right_holds) else _WIDE])
-
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns how often the needle was grasped anew, and what it did to the rings."""
     return {
       "regrasped": self.regrasps, "ring_time": self.scraping, "ring_force": self.worst
     }  # fmt: skip
-
-  def label(self, kind: str) -> str:
-    """Returns what a drop is."""
-    return "needle" if kind == "drop" else super().label(kind)
 
   def instruct(self, physics: Physics) -> str:
     """Says what is next."""
@@ -371,13 +326,13 @@ class Transfer(Task):
       mine, others = self.right_holds > 0, self.left_holds > 0
       giver, taker = (others, mine) if back(self) else (mine, others)
       if giver and taker and self.through:
-        yield from _do(p, gives, _let_go(self, gives))
+        yield from one(p, gives, _let_go(self, gives))
       elif giver and self.through < 0.47 - _HANDS / math.pi:
-        yield from _do(p, gives, self._drive(gives))
+        yield from one(p, gives, self._drive(gives))
       elif giver:
-        yield from _do(p, takes, self._take(takes))
+        yield from one(p, takes, self._take(takes))
       elif taker and self.through:
-        yield from _do(p, takes, self._pull(takes))
+        yield from one(p, takes, self._pull(takes))
       else:
         yield from p.wait(0.1)
 
@@ -404,12 +359,10 @@ class Transfer(Task):
     sign = -1.0 if back(self) else 1.0
     pos, mat = needle(p.physics)
     goal, turn = grasp(p.trocar, pos, mat, sign * _TAKES, p.turn)
-    p.extra[:] = _WIDE
+    p.extra[:] = WIDE
     yield from move_tip(p, goal + _RISE * mat[:, 2], turn)
     yield from move_tip(p, goal, turn)
-    while p.extra[0] > -1.0:
-      p.extra[0] = max(p.extra[0] - 3.0 * p.dt, -1.0)
-      yield p.step()
+    yield from jaws(p, -1.0)
     yield from p.wait(0.2)
 
   def _pull(self, p: Performer) -> Script:
@@ -419,13 +372,7 @@ class Transfer(Task):
     yield from carry(p, lambda t: posed(self, ring, start + t * (end - start)), end - start)
 
 
-def needle(physics: Any) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the middle of the needle's circle [m] (3,), and its frame in columns (3, 3)."""
-  places = [needle_place(physics, place) for place in (np.zeros(3), *np.eye(3))]
-  return places[0], np.column_stack([place - places[0] for place in places[1:]])
-
-
-def posed(task: Transfer, ring: int, turn: float) -> tuple[np.ndarray, np.ndarray]:
+def posed(task: Transfer, ring: int, turn: float) -> Pose:
   """Returns the needle's pose in a ring, turned by an angle about its circle [rad].
 
   The circle lies level and goes through the ring's middle, at a polar angle of -90 degrees.
@@ -436,7 +383,7 @@ def posed(task: Transfer, ring: int, turn: float) -> tuple[np.ndarray, np.ndarra
   return task.middles[ring] + RADIUS * side, np.column_stack([x, np.cross(up, x), up])
 
 
-def entrance(task: Transfer, ring: int) -> tuple[np.ndarray, np.ndarray]:
+def entrance(task: Transfer, ring: int) -> Pose:
   """Returns the needle's pose in front of a ring, the end that goes first before it."""
   sign = -1.0 if ring % 2 else 1.0
   return posed(task, ring, -QUARTER - sign * (QUARTER + _ENTERS))
@@ -450,106 +397,16 @@ def turn_of(task: Transfer, physics: Any) -> float:
   return math.remainder(math.atan2(x @ side, x @ way) + QUARTER, 2 * math.pi) - QUARTER
 
 
-def grasp(
-  port: Any, pos: np.ndarray, mat: np.ndarray, angle: float, like: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the tip's pose that has the needle across the jaws at an angle along its arc [rad].
-
-  Of the two ways round it is the one that turns the shaft less, from a pose or from zero.
-  """
-  radial = math.cos(angle) * mat[:, 0] + math.sin(angle) * mat[:, 1]
-  place = pos + RADIUS * radial - _BITE * mat[:, 2]
-  across = np.cross(mat[:, 2], radial)
-  ways = [np.column_stack([s * radial, s * across, mat[:, 2]]) for s in (1, -1)]
-  roll = 0.0 if like is None else float(wrist.inverse(port, place, like)[2])
-  turned = [abs(float(wrist.inverse(port, place, turn)[2]) - roll) for turn in ways]
-  return place, ways[int(np.argmin(turned))]
-
-
-def park(task: Transfer, port: Any, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def park(task: Transfer, port: Any, middle: np.ndarray) -> Pose:
   """Returns a pose of a tip beside the rings, on the side of its trocar, jaws down."""
   aside = math.copysign(0.03, port.pos[0] - middle[0])
   turn = port.mat.copy()
   return middle + np.array([aside, 0.0, 0.02]), turn @ about(2, -QUARTER)
 
 
-def about(axis: int, angle: float) -> np.ndarray:
-  """Returns the rotation about an axis."""
-  way = np.zeros(4)
-  mujoco.mju_axisAngle2Quat(way, np.eye(3)[axis], angle)
-  mat = np.zeros(9)
-  mujoco.mju_quat2Mat(mat, way)
-  return mat.reshape(3, 3)
-
-
-def _do(p: Performer, hand: Performer, script: Script) -> Script:
-  """Does the script of one hand while the other stays."""
-  still: Iterator[np.ndarray] = iter(())
-  yield from p.both(*((script, still) if hand is p else (still, script)))
-
-
-def between(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
-  """Returns a frame a share of the way from one to another."""
-  quat, spin = trocar.orientation(a.T @ b), np.zeros(3)
-  mujoco.mju_quat2Vel(spin, quat, 1.0)
-  angle = float(np.linalg.norm(spin))
-  if angle < 1e-9:
-    return b
-  mujoco.mju_axisAngle2Quat(quat, spin / angle, t * angle)
-  mat = np.zeros(9)
-  mujoco.mju_quat2Mat(mat, quat)
-  return a @ mat.reshape(3, 3)
-
-
-def move_tip(p: Performer, goal: np.ndarray, turn: np.ndarray) -> Script:
-  """Moves the tip of a hand to a pose."""
-  start, before = p.tip.copy(), p.turn.copy()
-  angle = math.acos(float(np.clip((np.trace(before.T @ turn) - 1) / 2, -1.0, 1.0)))
-  far = max(float(np.linalg.norm(goal - start)) / _SPEED, angle / _TURN) / p.style.speed
-  for t in p.shares(max(2, round(far / p.dt))):
-    p.tip, p.turn = start + t * (goal - start), between(before, turn, t)
-    yield p.step()
-
-
-def carry(p: Performer, path: Any, angle: float | None = None) -> Script:
-  """Moves the needle with the hand that holds it.
-
-  Args:
-    p: of the hand
-    path: returns the needle's pose at a share of the way, or its end alone
-    angle: that it turns by on the way [rad]; None to go to the end in a line
-  """
-  pos, mat = needle(p.physics)
-  held = mat.T @ (p.hand.tip_pos() - pos)
-  frame = mat.T @ frame_of(p.hand)
-  end, turn = path(1.0)
-  far = float(np.linalg.norm(end - pos)) / _SPEED
-  spun = math.acos(float(np.clip((np.trace(mat.T @ turn) - 1) / 2, -1.0, 1.0)))
-  spun = abs(angle) if angle is not None else spun
-  for t in p.shares(max(2, round(max(far, spun / _TURN) / p.style.speed / p.dt))):
-    if angle is None:
-      place, now_turned = pos + t * (end - pos), between(mat, turn, t)
-    else:  # what it is off the path at the start is made up on the way
-      goal, aim = path(t)
-      start, first = path(0.0)
-      place = goal + (1 - t) * (pos - start)
-      now_turned = aim @ between(first.T @ mat, np.eye(3), t)
-    p.tip, p.turn = place + now_turned @ held, now_turned @ frame
-    yield p.step()
-
-
 def _let_go(task: Transfer, p: Performer) -> Script:
   """Opens the jaws and takes the hand aside."""
-  while p.extra[0] < _WIDE:
-    p.extra[0] = min(p.extra[0] + 3.0 * p.dt, _WIDE)
-    yield p.step()
+  yield from jaws(p, WIDE)
   yield from move_tip(p, p.tip + _RISE * p.turn[:, 2], p.turn)
   pos, turn = park(task, p.trocar, task.middles.mean(axis=0))
   yield from move_tip(p, pos, turn)
-
-
-def frame_of(hand: Any) -> np.ndarray:
-  """Returns the frame of a tip, in columns."""
-  mat = np.zeros(9)
-  mujoco.mju_quat2Mat(mat, hand.tip_quat())
-  return mat.reshape(3, 3)

@@ -1,0 +1,242 @@
+"""What exercises with a curved needle share: who holds it, and an expert's ways of moving it.
+
+The needle is the one that `palpate.add_needle` makes by default, half a circle of 26 mm. Shares of
+it count from the swage, angles along its arc from the middle. It begins in the right hand's jaws.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+from palpate.models import trocar, wrist
+
+from ..core.base import Task
+from ..core.performer import Performer, Script
+from ..core.rules import (
+  drop,
+  length,
+  needle_place,
+  other_pinch,
+  other_tip,
+  pinch,
+  sine,
+  tip,
+  vector,
+)
+
+RADIUS = 0.026 / math.pi  # of the needle's circle [m]
+QUARTER = 0.5 * math.pi
+PIECES = 16  # that the needle is looked at in
+HELD, NEAR = 1.0, 0.008  # of jaws that hold the needle: least force [N], farthest from it [m]
+LOST = 0.5  # how long nobody may hold it [s]
+MEETS = 8  # bit of what meets the needle, besides bit 1 of what meets the organ
+WIDE = 0.15  # action of the jaws: open
+_OPENING = 0.056  # of each jaw, just off the wire [rad]
+_BITE = 0.0036  # from the tip of the jaws to the wire between them [m]
+_SPEED, _TURN, _CLOSE = 0.03, 1.2, 3.0  # of an expert's hand [m/s, rad/s] and jaws [1/s]
+
+Pose = tuple[np.ndarray, np.ndarray]  # place [m] (3,), and frame in columns (3, 3)
+
+
+class Hands:
+  """State of the hands that hold a needle."""
+
+  control_timestep: float  # [s]
+  right_holds: float
+  left_holds: float
+  loose: float  # how long nobody has held it [s]
+  regrasps: float
+
+
+# The rules.
+
+
+def arc(s, share):
+  """Returns where a share of the needle from the swage on ends [m]."""
+  angle = 2.0 * QUARTER * (share - 0.5)
+  return needle_place(s, vector(RADIUS * sine(angle + QUARTER), RADIUS * sine(angle), 0.0))
+
+
+def away(s, place):
+  """Returns how far a place is from the needle's nearest piece [m]."""
+  least = float(1.0)  # noqa: UP018 - a variable to Warp
+  for k in range(PIECES + 1):
+    least = min(least, length(arc(s, float(k) / float(PIECES)) - place))
+  return least
+
+
+def right_grasp(s):
+  """Returns 1 where the first hand, the right one, holds the needle, otherwise 0."""
+  return 1.0 if pinch(s) > HELD and away(s, tip(s)) < NEAR else 0.0
+
+
+def left_grasp(s):
+  """Returns the same of the other hand."""
+  return 1.0 if other_pinch(s) > HELD and away(s, other_tip(s)) < NEAR else 0.0
+
+
+def grasped(s, o, right, left):
+  """Follows which hands hold the needle, and how long none does."""
+  o.regrasps = o.regrasps + max(right - o.right_holds, 0.0) + max(left - o.left_holds, 0.0)
+  if right + left == 0.0 and o.right_holds + o.left_holds > 0.0:
+    drop(s, o)
+  o.right_holds = right
+  o.left_holds = left
+  o.loose = o.loose + o.control_timestep if right + left == 0.0 else 0.0
+  return o
+
+
+class Needlework(Task):
+  """An exercise with a needle; a domain that derives from it has the state `Hands`."""
+
+  watch = ("drop", "unintended_contact")
+
+  def meet(self, spec: mujoco.MjSpec) -> None:
+    """Lets the needle meet what the instruments meet the organ with."""
+    hands = tuple(prefix for prefix in (self.prefix, self.second) if prefix)
+    for geom in spec.geoms:
+      if geom.parent.name.startswith(hands) and geom.contype & 1:
+        geom.contype, geom.conaffinity = geom.contype | MEETS, geom.conaffinity | MEETS
+
+  def take_up(
+    self, physics: Any, pose: Pose, angle: float, lean: float, along: float
+  ) -> np.ndarray:
+    """Puts the needle into the right hand's jaws, as an episode begins.
+
+    Args:
+      physics: see `Physics`
+      pose: of the needle
+      angle: where the jaws hold it, along its arc [rad]
+      lean: most that it is turned about each axis of the world, drawn [rad]
+      along: most that the jaws are off the angle, drawn [rad]
+
+    Returns:
+      Where its tip is [m]  (3,).
+    """
+    place, mat = pose
+    turned = self.random.uniform(-lean, lean, 3)
+    mat = about(0, turned[0]) @ about(1, turned[1]) @ about(2, turned[2]) @ mat
+    angle = angle + self.random.uniform(-along, along)
+    port = physics.trocar()
+    physics.set_joints(wrist.inverse(port, *grasp(port, place, mat, angle)))
+    self.joints = {"needle": np.concatenate([place, trocar.orientation(mat)])}
+    self.joints |= {f"{self.prefix}jaw_{side}": np.array([_OPENING]) for side in ("left", "right")}
+    self.right_holds, self.left_holds, self.loose, self.regrasps = 1.0, 0.0, 0.0, 0.0
+    return place + RADIUS * mat[:, 1]
+
+  def still(self, hand: int) -> np.ndarray:
+    """Returns what keeps the jaws closed on the needle, or open."""
+    return np.array([-1.0 if (self.left_holds if hand else self.right_holds) else WIDE])
+
+  def label(self, kind: str) -> str:
+    """Returns what a drop is."""
+    return "needle" if kind == "drop" else super().label(kind)
+
+
+# Where the needle is, and how it is held.
+
+
+def needle(physics: Any) -> Pose:
+  """Returns the needle's pose: the middle of its circle, z along the circle's axis."""
+  places = [needle_place(physics, place) for place in (np.zeros(3), *np.eye(3))]
+  return places[0], np.column_stack([place - places[0] for place in places[1:]])
+
+
+def grasp(
+  port: Any, pos: np.ndarray, mat: np.ndarray, angle: float, like: np.ndarray | None = None
+) -> Pose:
+  """Returns the tip's pose that has the needle across the jaws at an angle along its arc [rad].
+
+  Of the two ways round it is the one that turns the shaft less, from a pose or from zero.
+  """
+  radial = math.cos(angle) * mat[:, 0] + math.sin(angle) * mat[:, 1]
+  place = pos + RADIUS * radial - _BITE * mat[:, 2]
+  across = np.cross(mat[:, 2], radial)
+  ways = [np.column_stack([s * radial, s * across, mat[:, 2]]) for s in (1, -1)]
+  roll = 0.0 if like is None else float(wrist.inverse(port, place, like)[2])
+  turned = [abs(float(wrist.inverse(port, place, turn)[2]) - roll) for turn in ways]
+  return place, ways[int(np.argmin(turned))]
+
+
+def about(axis: int, angle: float) -> np.ndarray:
+  """Returns the rotation about an axis by an angle [rad]."""
+  quat = np.zeros(4)
+  mujoco.mju_axisAngle2Quat(quat, np.eye(3)[axis], angle)
+  return trocar.matrix(quat)
+
+
+def between(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
+  """Returns a frame a share of the way from one to another."""
+  quat, spin = trocar.orientation(a.T @ b), np.zeros(3)
+  mujoco.mju_quat2Vel(spin, quat, 1.0)
+  angle = float(np.linalg.norm(spin))
+  if angle < 1e-9:
+    return b
+  mujoco.mju_axisAngle2Quat(quat, spin / angle, t * angle)
+  return a @ trocar.matrix(quat)
+
+
+def apart(a: np.ndarray, b: np.ndarray) -> float:
+  """Returns the angle between two frames [rad]."""
+  return math.acos(float(np.clip((np.trace(a.T @ b) - 1) / 2, -1.0, 1.0)))
+
+
+# An expert's motions.
+
+
+def one(p: Performer, hand: Performer, script: Script) -> Script:
+  """Does the script of one of two hands while the other stays."""
+  still: Iterator[np.ndarray] = iter(())
+  yield from p.both(*((script, still) if hand is p else (still, script)))
+
+
+def jaws(p: Performer, goal: float) -> Script:
+  """Opens or closes the jaws to an action: `WIDE`, or -1 on the needle."""
+  while p.extra[0] != goal:
+    p.extra[0] = np.clip(goal, p.extra[0] - _CLOSE * p.dt, p.extra[0] + _CLOSE * p.dt)
+    yield p.step()
+
+
+def arrive(p: Performer) -> Script:
+  """Waits for a hand that is late."""
+  if p.style.reaction:
+    yield from p.wait(p.style.reaction + 0.1)
+
+
+def move_tip(p: Performer, goal: np.ndarray, turn: np.ndarray) -> Script:
+  """Moves the tip of a hand to a pose."""
+  start, before = p.tip.copy(), p.turn.copy()
+  for t in p.shares(_steps(p, goal - start, apart(before, turn))):
+    p.tip, p.turn = start + t * (goal - start), between(before, turn, t)
+    yield p.step()
+
+
+def carry(p: Performer, path: Callable[[float], Pose], angle: float | None = None) -> Script:
+  """Moves the needle with the hand that holds it.
+
+  Args:
+    p: of the hand
+    path: returns the needle's pose at a share of the way, or its end alone
+    angle: that it turns by on the way [rad]; None to go to the end in a line
+  """
+  pos, mat = needle(p.physics)
+  held, frame = mat.T @ (p.hand.tip_pos() - pos), mat.T @ trocar.matrix(p.hand.tip_quat())
+  end, turn = path(1.0)
+  for t in p.shares(_steps(p, end - pos, apart(mat, turn) if angle is None else abs(angle))):
+    if angle is None:
+      place, now_turned = pos + t * (end - pos), between(mat, turn, t)
+    else:  # what it is off the path at the start is made up on the way
+      goal, aim = path(t)
+      start, first = path(0.0)
+      place = goal + (1 - t) * (pos - start)
+      now_turned = aim @ between(first.T @ mat, np.eye(3), t)
+    p.tip, p.turn = place + now_turned @ held, now_turned @ frame
+    yield p.step()
+
+
+def _steps(p: Performer, way: np.ndarray, angle: float) -> int:
+  """Returns how many control steps a hand takes for a way [m] and a turn [rad]."""
+  duration = max(float(np.linalg.norm(way)) / _SPEED, angle / _TURN) / p.style.speed
+  return max(2, round(duration / p.dt))
