@@ -333,8 +333,8 @@ class Transfer(Needlework):
         yield from one(p, takes, self._take(takes))
       elif taker and self.through:
         yield from one(p, takes, self._pull(takes))
-      else:
-        yield from p.wait(0.1)
+      else:  # nobody holds it
+        yield from Performer.wait(p, 0.1)  # a teacher too
 
   def _drive(self, p: Performer) -> Script:
     """Brings the end that goes first to the ring, and turns it through as far as to be taken."""
