@@ -23,12 +23,27 @@ from palpate.tissue.types import Array, fill, floats, ints, struct
 from .. import private
 from ..private import ConstraintType
 
+# Columns of mujoco_warp's rows that move with them.
 _INTS = ("type", "id", "J_rownnz", "J_rowadr")
 _FLOATS = ("pos", "margin", "D", "vel", "aref", "frictionloss")
 _CONTACT = wp.constant(int(ConstraintType.CONTACT_FRICTIONLESS))  # and what comes after it
 _FRICTION = wp.constant(int(ConstraintType.FRICTION_DOF))
 _PAIR = wp.constant(64)  # contacts of two geoms, at most
 _LANES = wp.constant(16)  # threads of a world that add up what rows do to dofs
+
+
+@struct
+class Ints:
+  """A column of all rows."""
+
+  column: ints("nworld", "njmax")
+
+
+@struct
+class Floats:
+  """The same of numbers."""
+
+  column: floats("nworld", "njmax")
 
 
 @struct
@@ -42,14 +57,8 @@ class Rows:
   block_nrow: ints("nworld", "njmax")
   type: ints("nworld", "njmax")
   id: ints("nworld", "njmax")  # of the joint, the contact, ...
-  J_rownnz: ints("nworld", "njmax")
-  J_rowadr: ints("nworld", "njmax")
-  pos: floats("nworld", "njmax")
-  margin: floats("nworld", "njmax")
-  D: floats("nworld", "njmax")
-  vel: floats("nworld", "njmax")
-  aref: floats("nworld", "njmax")
-  frictionloss: floats("nworld", "njmax")
+  moved: Array(Ints, ("nint",))  # what moves: `_INTS`, and `part`
+  moved_float: Array(Floats, ("nfloat",))
   frictionadr: ints("nworld", "nv")  # row of a dof's friction
   contact_geom: Array(wp.vec2i, ("naconmax",))
   contact_number: ints("naconmax")  # among those of two geoms
@@ -57,8 +66,9 @@ class Rows:
   key: Array(wp.int64, ("nworld", "njmax"))  # what rows are ordered by
   part: ints("nworld", "njmax")  # which of its contact's rows
   place: ints("nworld", "njmax")  # where a row goes
-  kept: ints(7, "nworld", "njmax")  # what is moved
-  kept_float: floats(6, "nworld", "njmax")
+  kept: ints("nint", "nworld", "njmax")  # what is moved
+  kept_float: floats("nfloat", "nworld", "njmax")
+  kept_block: ints(2, "nworld", "njmax")
 
 
 @wp.func
@@ -103,17 +113,10 @@ def _keep(r: Rows):
     if other < key or (other == key and q < k):
       to += 1
   r.place[w, k] = to
-  r.kept[0, w, to] = r.type[w, k]
-  r.kept[1, w, to] = r.id[w, k]
-  r.kept[2, w, to] = r.J_rownnz[w, k]
-  r.kept[3, w, to] = r.J_rowadr[w, k]
-  r.kept[4, w, to] = r.part[w, k]
-  r.kept_float[0, w, to] = r.pos[w, k]
-  r.kept_float[1, w, to] = r.margin[w, k]
-  r.kept_float[2, w, to] = r.D[w, k]
-  r.kept_float[3, w, to] = r.vel[w, k]
-  r.kept_float[4, w, to] = r.aref[w, k]
-  r.kept_float[5, w, to] = r.frictionloss[w, k]
+  for f in range(r.moved.shape[0]):
+    r.kept[f, w, to] = r.moved[f].column[w, k]
+  for f in range(r.moved_float.shape[0]):
+    r.kept_float[f, w, to] = r.moved_float[f].column[w, k]
 
 
 @wp.kernel(enable_backward=False)
@@ -121,27 +124,23 @@ def _move(r: Rows):
   """Moves rows to their places, and finds those of blocks."""
   w, k = wp.tid()
   if k < _count(r, w):
-    r.type[w, k] = r.kept[0, w, k]
-    r.id[w, k] = r.kept[1, w, k]
-    r.J_rownnz[w, k] = r.kept[2, w, k]
-    r.J_rowadr[w, k] = r.kept[3, w, k]
-    r.pos[w, k] = r.kept_float[0, w, k]
-    r.margin[w, k] = r.kept_float[1, w, k]
-    r.D[w, k] = r.kept_float[2, w, k]
-    r.vel[w, k] = r.kept_float[3, w, k]
-    r.aref[w, k] = r.kept_float[4, w, k]
-    r.frictionloss[w, k] = r.kept_float[5, w, k]
-    if r.kept[0, w, k] >= _CONTACT:
-      r.contact_row[r.kept[1, w, k], r.kept[4, w, k]] = k
-    elif r.kept[0, w, k] == _FRICTION:
-      r.frictionadr[w, r.kept[1, w, k]] = k
+    for f in range(r.moved.shape[0]):
+      column = r.moved[f].column
+      column[w, k] = r.kept[f, w, k]
+    for f in range(r.moved_float.shape[0]):
+      numbers = r.moved_float[f].column
+      numbers[w, k] = r.kept_float[f, w, k]
+    if r.type[w, k] >= _CONTACT:
+      r.contact_row[r.id[w, k], r.part[w, k]] = k
+    elif r.type[w, k] == _FRICTION:
+      r.frictionadr[w, r.id[w, k]] = k
   if k < r.nblock[w]:
     adr = r.place[w, r.block_adr[w, k]]
     to = int(0)  # noqa: RUF046, UP018 - a variable to Warp
     for q in range(r.nblock[w]):
       to += wp.where(r.place[w, r.block_adr[w, q]] < adr, 1, 0)
-    r.kept[5, w, to] = adr
-    r.kept[6, w, to] = r.block_nrow[w, k]
+    r.kept_block[0, w, to] = adr
+    r.kept_block[1, w, to] = r.block_nrow[w, k]
 
 
 @wp.kernel(enable_backward=False)
@@ -149,8 +148,8 @@ def _move_blocks(r: Rows):
   """Moves blocks to their places."""
   w, k = wp.tid()
   if k < r.nblock[w]:
-    r.block_adr[w, k] = r.kept[5, w, k]
-    r.block_nrow[w, k] = r.kept[6, w, k]
+    r.block_adr[w, k] = r.kept_block[0, w, k]
+    r.block_nrow[w, k] = r.kept_block[1, w, k]
 
 
 # In place of kernels of mujoco_warp's, with their arguments.
@@ -291,26 +290,42 @@ def is_enough(m: Any, model: mujoco.MjModel) -> bool:
   )  # fmt: skip
 
 
+def _columns(kind: Any, arrays: list[wp.array]) -> wp.array:
+  """Returns an array of structs, each of which refers to one of the arrays."""
+  device = arrays[0].device
+  columns = [fill(kind, device, {"column": each}) for each in arrays]
+  return wp.array(columns, dtype=kind, device=device)
+
+
 class FixedOrder:
   """Puts the rows of mujoco_warp's constraints in order, and lets its step add them up in that."""
 
   def __init__(self, m: Any, d: Any):
     """Makes room for rows on their way."""
     efc, contact, shape = d.efc, d.contact, (d.nworld, d.njmax)
-    values = {name: getattr(efc, name) for name in (*_INTS, *_FLOATS)} | dict(
+    device = efc.type.device
+    part = wp.zeros(shape, dtype=int, device=device)
+    moved = [*(getattr(efc, name) for name in _INTS), part]
+    numbers = [getattr(efc, name) for name in _FLOATS]
+    values = dict(
       ngeom=m.ngeom,
       nefc=d.nefc,
       nblock=efc.jtdaj_nblock,
       block_adr=efc.jtdaj_adr,
       block_nrow=efc.jtdaj_nrow,
+      type=efc.type,
+      id=efc.id,
       frictionadr=d.dof_frictionadr,
       contact_geom=contact.geom,
       contact_number=contact.geomcollisionid,
       contact_row=contact.efc_address,
+      moved=_columns(Ints, moved),
+      moved_float=_columns(Floats, numbers),
+      part=part,
     )
-    values |= {"key": np.zeros(shape, np.int64), "kept": np.zeros((7, *shape))}
-    values |= {name: np.zeros(shape) for name in ("part", "place")}
-    self._rows = fill(Rows, d.qpos.device, values | {"kept_float": np.zeros((6, *shape))})
+    rooms = {"place": (), "kept": (len(moved),), "kept_float": (len(numbers),), "kept_block": (2,)}
+    values |= {name: np.zeros((*more, *shape)) for name, more in rooms.items()}
+    self._rows = fill(Rows, device, values | {"key": np.zeros(shape, np.int64)})
     self._shape = shape
 
   def sort(self) -> None:
