@@ -110,9 +110,13 @@ def test_path_of_a_scene():
   assert np.ptp(_render(str(models.path("gallbladder")))) > 100
 
 
-def test_a_picture_of_an_exercise_shows_the_expert_at_work():
-  start, later = _render("touch/easy"), _render("touch/easy", "--seconds", "1.0")
-  assert (np.abs(start - later).max(axis=2) > 40).mean() > 0.01  # the shaft has moved
+def test_the_expert_is_at_work_in_pictures_and_films_of_an_exercise():
+  later = _render("touch/easy", "--seconds", "1.0")
+  words = ["touch/easy", "--seconds", "1.0", "--fps", "2", "-o", "film.gif"]
+  assert cli.main(["render", *words, *SIZE]) == 0
+  start, half = (frame[..., :3].astype(int) for frame in imageio.imiter("film.gif"))
+  for moved in (half, later):
+    assert (np.abs(start - moved).max(axis=2) > 40).mean() > 0.01  # the shaft
 
 
 @pytest.mark.parametrize("suffix", ["webp", "jpg"])

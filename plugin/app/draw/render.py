@@ -31,8 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser):
     "--seconds",
     metavar="S",
     type=float,
-    help="simulated time: a picture shows its end, a film all of it (0, 2); in a picture of an "
-    "exercise its expert acts until then",
+    help="simulated time: a picture shows its end, a film all of it (0, 2); in an exercise its "
+    "expert acts, until the episode ends at most",
   )
   add("--fps", metavar="N", type=int, default=25, help="frames a second of a film (%(default)s)")
   add("--slower", metavar="X", type=float, default=1.0, help="slow motion (%(default)s)")
@@ -54,9 +54,9 @@ def main(args: argparse.Namespace) -> int:
 
   moving = out.suffix.lower() in film.FILMS
   seconds = args.seconds if args.seconds is not None else (2.0 if moving else 0.0)
-  model, data = scenes.load(args, handle=False, seconds=0.0 if moving else seconds)
+  model, data, step = scenes.load(args, handle=False)
   with Interrupt() as interrupt, film.renderer(model, width, height) as renderer:
-    shots = _shots(args, model, data, renderer, seconds, moving)
+    shots = _shots(args, model, data, step, renderer, seconds, moving)
     progress = Progress()
     frames = 0
     with film.write(out, args.fps) as write:
@@ -98,7 +98,7 @@ def _camera(model, name: str | None) -> int | str:
   return name
 
 
-def _shots(args, model, data, renderer, seconds: float, moving: bool) -> Iterator[np.ndarray]:
+def _shots(args, model, data, step, renderer, seconds: float, moving: bool) -> Iterator[np.ndarray]:
   """Yields the pictures while the scene runs."""
   import mujoco
 
@@ -107,17 +107,13 @@ def _shots(args, model, data, renderer, seconds: float, moving: bool) -> Iterato
   if args.sites:
     option.sitegroup[3] = 1
   renderer.scene.flags[mujoco.mjtRndFlag.mjRND_WIREFRAME] = args.wireframe
-  steps = max(0, round((seconds - data.time) / model.opt.timestep))  # less what an expert has done
   nframe = max(round(seconds * args.fps * args.slower), 1) if moving else 1
-  done = 0
+  start = data.time
   for k in range(nframe):
-    until = round(steps * k / nframe) if moving else steps
-    while done < until:
-      mujoco.mj_step(model, data)
-      done += 1
+    running = step(seconds * k / nframe if moving else seconds)
     if not np.isfinite(data.qpos).all() or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
       raise CommandError(f"the motion diverged before {data.time:.3g} s", code=1)
-    if done == 0:
+    if data.time == start:
       mujoco.mj_forward(model, data)
     renderer.update_scene(data, camera, option)
     if args.edges:
@@ -125,6 +121,8 @@ def _shots(args, model, data, renderer, seconds: float, moving: bool) -> Iterato
     if args.forces:
       _draw_forces(model, data, renderer.scene)
     yield renderer.render()
+    if not running:
+      return
 
 
 def _draw_edges(model, data, scene, option):

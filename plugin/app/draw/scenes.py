@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+from collections.abc import Callable
 
 import mujoco
 
 from ..console import CommandError, compile_error
 from ..press import command
+
+# Model, data, and what steps them to a time [s]; that returns whether there is more to come.
+Shown = tuple[mujoco.MjModel, mujoco.MjData, Callable[[float], bool]]
 
 
 def add_arguments(parser: argparse.ArgumentParser):
@@ -41,22 +45,19 @@ def add_arguments(parser: argparse.ArgumentParser):
   parser.add_argument("--keyframe", metavar="NAME", help="state to start from (the first keyframe)")
 
 
-def load(
-  args: argparse.Namespace, handle: bool, seconds: float = 0.0
-) -> tuple[mujoco.MjModel, mujoco.MjData]:
-  """Returns model and data at the keyframe.
+def load(args: argparse.Namespace, handle: bool) -> Shown:
+  """Returns the scene at its keyframe; in an exercise its expert acts.
 
   Args:
     args: the options
     handle: whether named organs get handles to drag
-    seconds: for which an exercise's expert acts
   """
   from palpate import models
   from palpate.models import situs
 
   options = ("nodes", "seed", "instruments", "coupling")
   given = [option for option in options if getattr(args, option) is not None]
-  if not given and (found := _exercise(args.scene, seconds)):
+  if not given and (found := _exercise(args.scene)):
     return found
   try:
     if args.scene in models.NAMES:
@@ -77,11 +78,21 @@ def load(
     raise CommandError(compile_error(error)) from None
   data = mujoco.MjData(model)
   reset(model, data, args.keyframe)
-  return model, data
+
+  start, done = data.time, 0
+
+  def step(until: float) -> bool:  # counts: MuJoCo sets the time back where a motion diverges
+    nonlocal done
+    for _ in range(done, round((until - start) / model.opt.timestep)):
+      mujoco.mj_step(model, data)
+      done += 1
+    return True
+
+  return model, data, step
 
 
-def _exercise(name: str, seconds: float) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
-  """Returns model and data of an exercise of seed 0, None where it is none."""
+def _exercise(name: str) -> Shown | None:
+  """Returns an exercise of seed 0, None where it is none."""
   from palpate import tasks
   from palpate.tasks.core import performer
 
@@ -90,9 +101,14 @@ def _exercise(name: str, seconds: float) -> tuple[mujoco.MjModel, mujoco.MjData]
     return None
   env = tasks.load(domain, task, task_kwargs={"random": 0})
   timestep, act = env.reset(), performer.make(env)
-  while env.physics.time() < seconds and not timestep.last():
-    timestep = env.step(act(timestep))
-  return env.physics.model.ptr, env.physics.data.ptr
+
+  def step(until: float) -> bool:
+    nonlocal timestep
+    while env.physics.time() < until - 1e-9 and not timestep.last():
+      timestep = env.step(act(timestep))
+    return not timestep.last()
+
+  return env.physics.model.ptr, env.physics.data.ptr, step
 
 
 def _abdomen(args: argparse.Namespace, handle: bool) -> mujoco.MjModel:

@@ -44,7 +44,7 @@ def _load(args: argparse.Namespace):
   """Returns model and data; the viewer starts with the laparoscope."""
   from . import scenes
 
-  model, data = scenes.load(args, handle=True)
+  model, data, _ = scenes.load(args, handle=True)
   first = scenes.first_camera(model)
   if first >= 0:
     look = model.vis.global_
