@@ -136,10 +136,15 @@ def machine() -> dict:
 
 
 def _commit() -> str:
-  """Returns the state of the code, with `-dirty` if it has changes; empty without git."""
-  command = ["git", "-C", str(FOLDER), "describe", "--always", "--dirty", "--exclude=*"]
+  """Returns the commit, with `-dirty` if more than results has changed; empty without git."""
+
+  def ask(*words: str) -> str:
+    git = ["git", "-C", str(FOLDER), *words]
+    return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+
   try:
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    changed = ask("status", "--porcelain", "--untracked-files=no", ":/", ":(exclude).")
+    return ask("rev-parse", "--short", "HEAD") + "-dirty" * bool(changed)
   except (OSError, subprocess.CalledProcessError):
     return ""
 

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import pathlib
+import subprocess
 
 import mujoco
 import numpy as np
@@ -367,3 +368,19 @@ def test_skipping_bench_gives_a_row_to_every_feature(tmp_path):
   assert {"nothing", "bending", "volume", "foundation", "contact", "readback"} <= left_out
   assert {"dofs", "all"} <= left_out  # windows, and asleep
   assert all(math.isfinite(r["with_ms"]) and r["with_ms"] > 0 for r in rows)
+
+
+def test_results_of_a_bench_are_no_changes_of_the_code(tmp_path, monkeypatch):
+  folder = tmp_path / "tests" / "results"
+  folder.mkdir(parents=True)
+  monkeypatch.setattr(results, "FOLDER", folder)
+  code, rows = tmp_path / "code.py", folder / "rows.csv"
+  code.write_text("1\n"), rows.write_text("1\n")
+  own = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+  for words in (["init", "-q"], ["add", "."], [*own, "commit", "-qm", "a"]):
+    subprocess.run(["git", "-C", str(tmp_path), *words], check=True)
+  clean = results.machine()["commit"]
+  rows.write_text("2\n")
+  assert len(clean) >= 7 and results.machine()["commit"] == clean
+  code.write_text("2\n")
+  assert results.machine()["commit"] == f"{clean}-dirty"
