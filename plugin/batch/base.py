@@ -16,6 +16,7 @@ from palpate.organ import instances
 from palpate.tissue.geometry.mesh import Mesh
 
 from .cutting.fracture import Parting
+from .needles import Needles
 
 if TYPE_CHECKING:
   from palpate.camera import Camera
@@ -471,6 +472,18 @@ class Tissue(Parting):
   @abc.abstractmethod
   def bonds(self) -> Any:
     """What it has grown on to, see `palpate.batch.bonds.Bonds`."""
+
+  @property
+  @abc.abstractmethod
+  def needles(self) -> Needles:
+    """What the needles do that may go through it.
+
+    Raises:
+      ValueError: there is none.
+    """
+
+  def _no_needles(self) -> ValueError:
+    return ValueError(f"organ {self.name!r}: nothing goes through it, expected the key needles")
 
   def meshes(self) -> Sequence[Mesh]:
     """Returns the mesh of each world; it is another object once it was cut."""

@@ -99,7 +99,7 @@ class Host(host.Host):
 
   @functools.cached_property
   def _lifted(self) -> wp.array:
-    return self.zeros(self._batch.bare.ngeom + 2 * self._batch.bare.nflex, dtype=int)
+    return self.zeros(self.m.ngeom + 2 * self.m.nflex, dtype=int)
 
   def lifted(self) -> wp.array:
     """See `Host`."""

@@ -90,6 +90,11 @@ class Material:
     self._organ.body.tissue.number.assign(number)
     self._firm_up(worlds, number[worlds])
 
+  @property
+  def thickness(self) -> np.ndarray:
+    """Thickness of the wall of each world [m]."""
+    return self._worlds["thickness"]
+
   def _put(self, array: wp.array, worlds: np.ndarray, values: np.ndarray):
     whole = array.numpy()
     whole[worlds] = values

@@ -19,6 +19,7 @@ from palpate.tissue.cutting.topology import Report
 from .base import Batch, Contacts, Thread, Tissue, on_device, spread
 from .bonds import Gathered
 from .cutting.fracture import Cutters
+from .needles import Needles
 from .worlds import Worlds
 
 
@@ -193,6 +194,18 @@ class _Gathered(Tissue):
     return Gathered(self.batch, [part.bonds for part in self._parts])
 
   @property
+  def needles(self) -> Needles:
+    """What the needles do that may go through it, see `Tissue`."""
+    return Needles(*self._each("needle", [part.needles for part in self._parts]))
+
+  def _each(self, name: str, parts: Sequence[Any]) -> list[wp.array]:
+    """Returns the arrays of named tuples of all parts, in their order."""
+    return [
+      self._gather(f"{name}_{field}", [getattr(part, field) for part in parts])
+      for field in parts[0]._fields
+    ]
+
+  @property
   def _spare(self) -> int:
     return self._parts[0]._spare
 
@@ -215,9 +228,7 @@ class _Gathered(Tissue):
     return self._gather("piece_count", [part.piece_count for part in self._parts])
 
   def _cutters(self) -> Cutters:
-    parts = [part.cutters for part in self._parts]
-    names = Cutters._fields
-    return Cutters(*(self._gather(n, [getattr(part, n) for part in parts]) for n in names))
+    return Cutters(*self._each("cutter", [part.cutters for part in self._parts]))
 
   def elem_of(self, world: int) -> np.ndarray:
     """Returns the triangles of a world, see `Tissue.elem_of`."""
@@ -227,10 +238,7 @@ class _Gathered(Tissue):
   @property
   def contacts(self) -> Contacts:
     """Contacts of the last step."""
-    parts = [part.contacts for part in self._parts]
-    names = Contacts._fields
-    every = {name: [getattr(part, name) for part in parts] for name in names}
-    return Contacts(*(self._gather(name, arrays) for name, arrays in every.items()))
+    return Contacts(*self._each("contact", [part.contacts for part in self._parts]))
 
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds, see `Tissue.configure`."""

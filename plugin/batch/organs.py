@@ -12,6 +12,7 @@ import warp as wp
 from palpate.engine import coupling
 from palpate.engine.windows import proxies
 from palpate.forces import cutters
+from palpate.forces.needles import Needles as Pierced
 from palpate.forces.passive import Forces
 from palpate.forces.table import FORCES
 from palpate.forces.tears import Tears
@@ -23,7 +24,7 @@ from palpate.tissue.cutting.topology import Report, pieces
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import fill
 
-from . import bonds, host, kernels, patch
+from . import bonds, host, kernels, needles, patch
 from .base import Contacts, Tissue, spread
 from .contact import contact_rows, contacts, convex
 from .cutting import blades
@@ -128,13 +129,13 @@ class Organ(Tissue):
     if organ.mesh.spare:
       self._cuts = Cuts(self, values, surface)
     self.patch = patch.make(values, self.body)
-    self._touch = contacts.make(model, organ, tools, lines, place, self.patch, d, batch.bare)
+    self.host, self._steps = host.Host(self), 0
+    self._touch = contacts.make(self, model, tools, lines)
     self._pressed = contact_rows.make(self, model, self._touch)
     self._convex = convex.make(model, tools, lines, nworld * place.nslot, m, d)
     kinds = {int(kind) for kind in model.geom_type[tools]} | ({contacts.LINE} if lines else set())
-    self._find, self._lines = contacts.kernel(frozenset(kinds)), []
+    self._find, self._lines = contacts.kernel(frozenset(kinds), self._touch.lifts > 0), []
     self._material = Material(self, batch, self._touch, self._pressed)
-    self.host, self._steps = host.Host(self), 0
     self.forces = Forces(self.host, FORCES)
 
   def follow(self, threads: Sequence[Thread]):
@@ -302,6 +303,21 @@ class Organ(Tissue):
     return out.view(float)
 
   @property
+  def needles(self) -> needles.Needles:
+    """What the needles do that may go through it, see `Tissue`."""
+    if not self._pierced:
+      raise self._no_needles()
+    return self._needles.read()
+
+  @property
+  def _pierced(self) -> Pierced:
+    return self.forces.of(Pierced)
+
+  @functools.cached_property
+  def _needles(self) -> needles.Shown:
+    return needles.Shown(self._pierced)
+
+  @property
   def contacts(self) -> Contacts:
     """Contacts of the last step."""
     p = self._pressed
@@ -379,6 +395,7 @@ class Organ(Tissue):
     self._material.change(chosen, rows)
     if "thickness" in rows:
       self.cuts_by.refresh(rows["thickness"], chosen)
+    self._pierced.refresh(self._pressed.tissue.numpy(), self._material.thickness)
     self.wake(chosen)
 
   def _fixed(self, key: str) -> str | None:

@@ -70,7 +70,7 @@ class Patch:
   mesh: ints("nworld")  # which of these a world has
   rest: doubles("nmesh", "nnode", 3)  # rest position [m]
   elem: ints("nmesh", "nelem", 3)  # nodes of a triangle, of solids those of the skin
-  tet: ints("nmesh", "ntet", 4)  # nodes of a tetrahedron, of solids that may be cut
+  tet: ints("nmesh", "ntet", 4)  # nodes of a tetrahedron, of solids that may be cut or pierced
   touch: doubles("nmesh", "nnode")  # distance of a geom within which its triangles may touch it [m]
   source: ints("nmesh", "nnode")  # what a node was before it was divided
   share: doubles("nmesh", "nnode")  # its part of that; 0 where it waits for a cut
@@ -211,11 +211,11 @@ class Surface:
 
   def make(self, mesh) -> dict[str, np.ndarray]:
     """Returns the fields of `Patch` that a cut changes, of the mesh before the first one."""
-    n = self._nnode
+    n, inside = self._nnode, bool(mesh.spare or self._organ.config.needles)
     out = {
       "rest": np.zeros((n, 3)),
       "elem": np.zeros((mesh.nelem, 3), np.int32),
-      "tet": np.zeros((len(mesh.tet) * (mesh.spare > 0), 4), np.int32),
+      "tet": np.zeros((len(mesh.tet) * inside, 4), np.int32),
       "touch": np.full(n, -np.inf),  # padding is never near
       "source": np.arange(n, dtype=np.int32),
       "share": np.ones(n),

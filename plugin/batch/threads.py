@@ -29,6 +29,7 @@ from . import base
 from .base import Batch, Tissue, spread
 from .bonds import OfThreads
 from .cutting.fracture import Cutters
+from .needles import Needles, gathered
 
 _OF_VERTICES = ("xpos", "xvel", "contact_force")
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -232,6 +233,13 @@ class _Tissue(Tissue):
   def bonds(self) -> OfThreads:
     """What it has grown on to."""
     return OfThreads(self.batch, self.handles)
+
+  @property
+  def needles(self) -> Needles:
+    """What the needles do that may go through it, see `Tissue`."""
+    if not self.space.needles:
+      raise self._no_needles()
+    return gathered([handle.needles for handle in self.handles])
 
   def _read(self, name: str) -> wp.array:
     array = self._arrays[name]

@@ -103,7 +103,7 @@ class Worlds(Batch):
       self.rods = rods.Rods(self, sewn)
       for organ, found in zip(self._organs.values(), lines, strict=True):
         organ.follow([list(self.rods.all.values())[k] for k in found])
-      self.aims = self._join()
+      self.aims, self.weighs = self._join()
       self._rest = Rest(self, bare)
       self._teller = states.Teller(self)
       self._alias()
@@ -190,8 +190,12 @@ class Worlds(Batch):
     """Numbers of the model's bodies in mujoco_warp's, see `host.numbers_of`."""
     return host.numbers_of(self)
 
-  def _join(self) -> bool:
-    """Lets organs have their forces; returns whether these ask where bodies are."""
+  def _join(self) -> tuple[bool, bool]:
+    """Lets organs have their forces.
+
+    Returns:
+      whether these ask where bodies are, and whether they add to the inertia of these
+    """
     organs = list(self._organs.values())
     twin = lambda force: self._organs[force.host.organ.name].forces.of(type(force))  # noqa: E731
     for organ in organs:
@@ -202,7 +206,8 @@ class Worlds(Batch):
       organ.host.bind(organ.host.model)
     for organ in organs:
       organ.forces.bind()
-    return any(each.aims for organ in organs for each in organ.forces)
+    forces = [each for organ in organs for each in organ.forces]
+    return any(each.aims for each in forces), any(each.weighs for each in forces)
 
   def _alias(self):
     """Lets controls, sensors and time be mujoco_warp's own arrays."""
@@ -222,6 +227,8 @@ class Worlds(Batch):
       for organ in organs:
         organ.push()
       self.rods.begin()
+      if self.weighs:
+        mjw.factor_m(m, d)
 
     self.m.callback.contactfilter = touch
     self.m.callback.passive = push

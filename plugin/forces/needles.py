@@ -153,7 +153,7 @@ class Needles(Force):
     names: of the needles' bodies
   """
 
-  KEYS, WORLDS = ("needles",), False
+  KEYS, WORLDS = ("needles",), True
   ENTER, ACT, END = _enter, _act, _keep
 
   def __init__(self, host: Host):
@@ -210,37 +210,54 @@ class Needles(Force):
   def take(self, declared: "Needles", twin: Any):
     """See `Force`."""
     if declared:
+      if not self.host.alone and any(each["flex"] >= 0 for each in declared._threads):
+        raise ValueError(
+          f"organ {self.host.organ.name!r}: needles names one with a thread, which a batch on a "
+          "GPU cannot hold in its holes yet"
+        )
       self.names, self._shape = declared.names, dict(declared._shape)
       self._threads = declared._threads
       self._slit, self._margin = declared._slit, declared._margin
-      numbers = [self.host.body_number(int(b)) for b in self._shape["body"]]
-      self._shape["body"] = np.array(numbers)
+      for name in ("body", "node"):
+        numbers = [self.host.body_number(int(b)) for b in self._shape[name]]
+        self._shape[name] = np.array(numbers, int)
       self.host.need_springs()
 
-  def _law(self) -> np.ndarray:
-    """Returns the rows of `Pierced.law`."""
+  def _law(self, asked: np.ndarray, thickness: Any) -> np.ndarray:
+    """Returns the rows of `Pierced.law`.
+
+    Args:
+      asked: R of a contact that the tissue of each world asks for, see `TISSUE` [1/kg]
+      thickness: of the wall of each [m]
+    """
     host, config = self.host, self.host.config
-    m, out = host.m, np.zeros((len(self.names), len(PIERCE)))
-    asked = contacts.tissue_of(m, host.organ, config)[..., contacts.TISSUE.asked]
-    stiffness = contacts.FIRM / (np.mean(asked) * (contacts.SLOW * float(m.opt.timestep)) ** 2)
+    m, out = host.m, np.zeros((len(asked), len(self.names), len(PIERCE)))
+    stiffness = contacts.FIRM / (asked * (contacts.SLOW * float(m.opt.timestep)) ** 2)
     bodies = [find_body(host, "needles", row.name) for row in config.needles]
     for k, row in enumerate(config.needles):
       free = bool(self._shape["floats"][k])
-      out[k, PIERCE.force] = row.energy * self._slit[k]
-      out[k, PIERCE.surface] = row.surface * self._slit[k]
-      out[k, PIERCE.friction] = row.friction
-      out[k, PIERCE.stiffness] = min(_FIRM * stiffness, np.inf if free else most(host, bodies[k]))
-      out[k, PIERCE.capstan] = self._threads[k]["friction"]
-      out[k, PIERCE.wall] = 0.0 if config.elements == "solid" else config.thickness
-      out[k, PIERCE.clear] = self._slit[k]
-      out[k, PIERCE.margin] = self._margin[k]
-      out[k, PIERCE.close] = self._threads[k]["close"]
+      out[:, k, PIERCE.force] = row.energy * self._slit[k]
+      out[:, k, PIERCE.surface] = row.surface * self._slit[k]
+      out[:, k, PIERCE.friction] = row.friction
+      out[:, k, PIERCE.stiffness] = np.minimum(
+        _FIRM * stiffness, np.inf if free else most(host, bodies[k])
+      )
+      out[:, k, PIERCE.capstan] = self._threads[k]["friction"]
+      out[:, k, PIERCE.wall] = 0.0 if config.elements == "solid" else thickness
+      out[:, k, PIERCE.clear] = self._slit[k]
+      out[:, k, PIERCE.margin] = self._margin[k]
+      out[:, k, PIERCE.close] = self._threads[k]["close"]
     return out
 
   @property
   def aims(self) -> bool:
     """See `Force`."""
     return bool(self)
+
+  @property
+  def weighs(self) -> bool:
+    """See `Force`: free needles meet the holes' inertia."""
+    return bool(self) and bool(self._shape["floats"].any())
 
   def bind(self):
     """See `Force`."""
@@ -254,7 +271,7 @@ class Needles(Force):
       nlisted=len(self._shape["geom"]),
       ngeom=host.m.ngeom,
       edge=float(host.organ.mesh.whole.edge_length),
-      law=np.tile(self._law(), (host.nworld, 1, 1)),
+      law=np.zeros((host.nworld, n, len(PIERCE))),
       lifted=host.lifted(),
       state=host.rows("needle", len(NEEDLE)),
       next=host.zeros(n, len(NEEDLE)),
@@ -263,6 +280,7 @@ class Needles(Force):
       weight=host.zeros(n),
     )  # fmt: skip
     self.fields = host.fill(Pierced, values, into=self.fields)
+    self.refresh()
     for k, thread in enumerate(self._threads if host.alone else ()):
       if thread["flex"] >= 0:
         self._hold(k, thread)
@@ -288,10 +306,21 @@ class Needles(Force):
       coupling.ties(self.host.data, self._threads[k]["flex"]).lead(self.host.instance)
       self.host.launch(_feel, held, arg=k)
 
-  def refresh(self):
-    """Takes the material that there is now."""
-    if self.fields is not None:
-      self.fields.law.assign(np.tile(self._law(), (self.host.nworld, 1, 1)))
+  def refresh(self, tissue: np.ndarray | None = None, thickness: Any = None):
+    """Takes the material that there is now.
+
+    Args:
+      tissue: TISSUE of each world; None for the configuration's
+      thickness: of the wall of each [m]; None for the configuration's
+    """
+    if self.fields is None:
+      return
+    host = self.host
+    if tissue is None:
+      tissue = np.atleast_2d(contacts.tissue_of(host.m, host.organ, host.config))
+      thickness = host.config.thickness
+    law = self._law(tissue[:, contacts.TISSUE.asked], thickness)
+    self.fields.law.assign(np.broadcast_to(law, self.fields.law.shape))
 
   def read(self, x: np.ndarray) -> list[Needle]:
     """Returns what the needles do, of one world, with vertices at places [m], (nvert, 3)."""

@@ -87,6 +87,11 @@ class Force:
     """Whether it has to know where bodies are as a step begins: they may move."""
     return False
 
+  @property
+  def weighs(self) -> bool:
+    """Whether it adds to MuJoCo's inertia of bodies."""
+    return False
+
   def take(self, declared: Force, twin: Any):
     """Takes what the same force of another mjData has; `twin` returns this one's of that's."""
 

@@ -28,7 +28,7 @@ from . import convex, cylinder
 from .convex import Convex
 
 if TYPE_CHECKING:
-  from palpate.engine.model.declare import Declaration
+  from ..organs import Organ
 
 _GEOM = mujoco.mjtGeom
 # Contacts of a triangle with a tool, at most, as mujoco_warp finds them.
@@ -73,6 +73,9 @@ class Touch:
   margin: floats("ntool")  # [m]
   condim: ints("ntool")
   whose: ints("ntool")  # whose sliding friction counts
+  lifts: int  # whether forces may let tools not touch it
+  lifted: ints("nworld", "nlift")  # what does not, see `engine.contacts.lifted`
+  line_lift: ints("nline")  # where a thread's edges are in that
   slide: floats("nworld", "ntool")  # the tool's
   rough: floats("nworld")  # the organ's
   friction: Array(vec5, ("ntool",))  # all of it, the sliding one as compiled
@@ -405,6 +408,17 @@ def _corners(p: Patch, world: int, e: int):
 
 
 @wp.func
+def _is_lifted(c: Touch, world: int, tool: int, geom: int):
+  """Returns whether forces let a tool not touch the organ."""
+  line = tool - (c.kind.shape[0] - c.nline)
+  if line < 0:
+    return c.lifted[world, geom] != 0
+  k = c.line_lift[line]
+  e = c.line_elem[line]
+  return c.lifted[world, k] <= e and e < c.lifted[world, k + 1]
+
+
+@wp.func
 def _owner(p: Patch, world: int, e: int):
   """Returns the first corner of a triangle that has a slot, whose thread has the triangle."""
   a, b, c = _corners(p, world, e)
@@ -414,8 +428,13 @@ def _owner(p: Patch, world: int, e: int):
 
 
 @functools.cache
-def kernel(kinds: frozenset[int]) -> wp.Kernel:
-  """Returns the kernel that counts or writes contacts with tools of these kinds, `ring` a slot."""
+def kernel(kinds: frozenset[int], lifts: bool) -> wp.Kernel:
+  """Returns the kernel that counts or writes contacts with tools of these kinds, `ring` a slot.
+
+  Args:
+    kinds: of the tools
+    lifts: whether forces may let tools not touch the organ
+  """
   against = _against(kinds)
 
   @wp.kernel(module="unique", enable_backward=False)
@@ -456,7 +475,10 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
             at.tool = tool
             at.geom = p.tool_geom[tool]
             pos, rot = _pose(p, world, tool)
-            if not convex.is_beyond(v, tool, pos, rot, centre, around + c.radius + c.margin[tool]):
+            far = convex.is_beyond(v, tool, pos, rot, centre, around + c.radius + c.margin[tool])
+            if wp.static(lifts):
+              far = far or _is_lifted(c, world, tool, at.geom)
+            if not far:
               more = against(p, c, v, at, more, xa, xb, xd)
           if whole:
             n = more
@@ -500,33 +522,21 @@ def most_of(model: mujoco.MjModel, tools: np.ndarray, lines: list, nslot: int) -
   return nslot * (many + 4 * bool(lines))
 
 
-def make(
-  model: mujoco.MjModel,
-  organ: "Declaration",
-  tools: np.ndarray,
-  lines: list,
-  place,
-  patch,
-  data,
-  bare: mujoco.MjModel,
-):
+def make(organ: "Organ", model: mujoco.MjModel, tools: np.ndarray, lines: list):
   """Returns how an organ touches its tools.
 
   Args:
+    organ: the organ in all worlds
     model: the compiled scene
-    organ: the organ's declaration
     tools: geoms that its slots follow
     lines: threads that they follow
-    place: where the stripped model has these
-    patch: the organ's slots
-    data: mujoco_warp's
-    bare: the stripped model
   """
-  nworld, nslot, flex = len(patch.missed), place.nslot, place.flex
+  patch, data, nworld = organ.patch, organ.batch.d, organ.batch.nworld
+  nslot, flex = organ.place.nslot, organ.place.flex
   # EPA has memory for one triangle of a slot at a time.
   alone = convex.KINDS & set(model.geom_type[tools].tolist())
   ring = 1 if alone else int(np.diff(patch.near_adr.numpy()).max())
-  own = organ.flexes[0]
+  own = organ.declared.flexes[0]
   rows = [_mix(model, "geom", int(g), own) for g in tools]
   if not contacts.says(mjstruct.Model.from_address(model._address), own):
     firm = {"solref": (contacts.SLOW * model.opt.timestep, 1.0), "solimp": _HARD}
@@ -536,10 +546,12 @@ def make(
     rows += [_mix(model, "flex", line.flex, own)] * int(count)
   radius, half = halves(lines)
   line_size = np.stack([radius, half, 0 * half], axis=1)
-  flexes = [mujoco.mj_name2id(bare, mujoco.mjtObj.mjOBJ_FLEX, line.name) for line in lines]
+  bare, kind = organ.batch.bare, mujoco.mjtObj.mjOBJ_FLEX
+  flexes = [mujoco.mj_name2id(bare, kind, line.name) for line in lines]
   mixed = {name: np.array([row[name] for row in rows]).reshape(-1, *wide)
            for name, wide in _MIXED.items()}  # fmt: skip
   contact = {f"out_{name}": getattr(data.contact, name) for name in _written()}
+  lifts = bool(organ.config.needles)
   values = mixed | contact | dict(
     most=most_of(model, tools, lines, nslot),
     nline=len(half),
@@ -557,6 +569,9 @@ def make(
     before=np.zeros(nworld),
     missed=patch.missed,
     start=np.zeros(1),
+    lifts=int(lifts),
+    lifted=organ.host.lifted() if lifts else np.zeros((nworld, 0)),
+    line_lift=np.repeat([model.ngeom + 2 * line.flex for line in lines], number),
     nacon=data.nacon,
   )  # fmt: skip
   return fill(Touch, data.nacon.device, values)

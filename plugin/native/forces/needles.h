@@ -70,9 +70,10 @@ PALPATE Arc arc_of(const Fields& f, int i) {
   const D3 zero = {0.0, 0.0, 0.0};
   const double* frame = f.own.frame.data;
   const double circle = f.circle.data[i], half = f.half.data[i];
-  return {add_turned(zero, frame, load(f.mj.xpos.data + 3 * b) - load(f.own.origin.data)),
-          add_turned(zero, frame, {R[0], R[3], R[6]}), add_turned(zero, frame, {R[1], R[4], R[7]}),
-          circle, half, 2.0 * half * circle};
+  D3 x = add_turned(zero, frame, {R[0], R[3], R[6]}), y = add_turned(zero, frame, {R[1], R[4], R[7]});
+  if constexpr (sizeof(*R) != sizeof(double)) x = unit_of(x), y = unit_of(across(y, x));  // to what TIGHT asks for
+  return {add_turned(zero, frame, load(f.mj.xpos.data + 3 * b) - load(f.own.origin.data)), x, y, circle, half,
+          2.0 * half * circle};
 }
 
 PALPATE D3 in_world(const double* frame, const double* origin, D3 p) { return load(origin) + turned(frame, p); }
@@ -399,19 +400,6 @@ PALPATE void close_holes(const Fields& f, int i, const Arc& arc, double* s) {
     if (on_thread(s, h)) follow_thread(f, i, arc, s, h);
 }
 
-// Holds a thread in a hole.
-template <class Fields>
-PALPATE void tie_thread(const Fields& f, Thread t, int i, int n, double k, double weight, double h, double* s) {
-  const auto thread = strand_of(f, i);
-  double part = 0.0;
-  const int e = thread.find(hole(s, n)[HOLE_THREAD], part);
-  const Seat seat = seat_of_hole(f, s, n);
-  const D3 at = (1.0 - part) * thread.at(e) + part * thread.at(e + 1);
-  const D3 vel = (1.0 - part) * thread.vel(e) + part * thread.vel(e + 1), along = {1.0, 0.0, 0.0};
-  const D3 force = k * (at - seat.at + h * (vel - seat.vel));
-  tie(f, t, POINTS * i + n, seat, at, force, across_and_along(2.0 * weight, 2.0 * weight, along), false);
-}
-
 // Ties a needle to its holes and its tip to its seat. What has slipped, as the step begins, bears a constant force,
 // so that it does not hang on speed.
 template <class Fields>
@@ -624,6 +612,40 @@ template <class Fields>
 PALPATE void keep_needles(const Fields& given, Thread t, int) {
   const Fields f = of_world(given, t.world);
   each_item(t, NEEDLE_LENGTH * f.nneedle, [&](int i) { f.state.data[i] = f.next.data[i]; });
+}
+
+// Tells what the needles of a batch do, a thread a world.
+template <class Fields>
+PALPATE void tell_needles(const Fields& all, Thread t, int) {
+  const auto f = of_world(all.pierced, t.world);
+  const auto& told = all.told;
+  const double *R = f.own.frame.data, *origin = f.own.origin.data;
+  for (int i = 0; i < f.nneedle; ++i) {
+    const int row = f.nneedle * t.world + i;
+    double* s = f.state.data + NEEDLE_LENGTH * i;
+    const double* force = f.force.data + 3 * POINTS * i;
+    const Arc arc = arc_of(f, i);
+    D3 sum = load(force + 3 * HOLES);
+    store(told.tip_force.data + 3 * row, turned(R, sum));
+    told.touches.data[row] = s[NEEDLE_STAGE] == TOUCHING;
+    told.inside.data[row] = s[NEEDLE_STAGE] == INSIDE;
+    told.energy.data[row] = (float)s[NEEDLE_WORK];
+    told.count.data[row] = (int)s[NEEDLE_COUNT];
+    for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
+      const int at = HOLES * row + n;
+      const Seat seat = seat_of_hole(f, s, n);
+      D3 rest = {0.0, 0.0, 0.0};
+      for (int c = 0; c < seat.count; ++c) rest += seat.share[c] * load(f.flat.data + 3 * seat.vert[c]);
+      told.hole_inside.data[at] = kind_of(s, n) == WITHIN;
+      told.hole_thread.data[at] = on_thread(s, n);
+      told.hole_along.data[at] = (float)(on_thread(s, n) ? -hole(s, n)[HOLE_THREAD] : arc.nearest(seat.at));
+      store(told.hole_at.data + 3 * at, in_world(R, origin, seat.at));
+      store(told.hole_rest.data + 3 * at, in_world(R, origin, rest));
+      store(told.hole_force.data + 3 * at, turned(R, load(force + 3 * n)));
+      sum += load(force + 3 * n);
+    }
+    store(told.force.data + 3 * row, turned(R, sum));
+  }
 }
 
 }  // namespace palpate

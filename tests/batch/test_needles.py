@@ -1,0 +1,136 @@
+"""Needles in batches: they pierce, hold and are drawn out as under the plugin."""
+
+import forces.test_needles as one
+import mujoco
+import numpy as np
+import palpate.batch
+import pytest
+from devices import needs_cuda
+from scenes import press
+
+DEVICES = ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
+SLOW = pytest.mark.slow
+COARSE = {"mesh": one.sheet(9)[0], "pin": one.sheet(9)[1], "tilt": 1.1}  # edges of 5 mm
+
+
+def scene(device: str, nworld: int = 2, **given):
+  """Returns a model, its data, its organ, and a batch of it."""
+  spec = one.scene(**given)
+  return *one.load(spec), palpate.batch.make(spec, nworld, device)
+
+
+def drive(model, data, worlds, turns, speed=20.0):
+  """Turns the hands to some angles [rad] in turn, in the plugin and in all worlds."""
+  for angle in turns:
+    start = data.ctrl[0]
+    steps = max(1, round(abs(angle - start) / (speed * one.STEP)))
+    for k in range(steps):
+      data.ctrl[0] = start + (angle - start) * (k + 1) / steps
+      mujoco.mj_step(model, data)
+      if worlds:
+        worlds.ctrl = np.tile(data.ctrl, (worlds.nworld, 1))
+        worlds.step()
+      yield k
+
+
+def compare(organ, worlds, limit: float, which=slice(None)):
+  """Compares what the needle does in some worlds with the plugin; forces to a limit [N]."""
+  tissue, (needle,) = worlds.organ(organ.name), organ.needles
+  found = {name: array.numpy()[which, 0] for name, array in tissue.needles._asdict().items()}
+  n = len(needle.holes)
+  assert (found["count"] == n).all()
+  for name in ("touches", "inside"):
+    assert (found[name] == getattr(needle, name)).all()
+  np.testing.assert_allclose(found["energy"], needle.energy, rtol=1e-3, atol=1e-7)
+  near = {name: (np.array([getattr(hole, name) for hole in needle.holes]), f"hole_{name}")
+          for name in ("inside", "thread", "along", "rest", "at", "force")}  # fmt: skip
+  near = {told: (found[told][:, :n], expected) for expected, told in near.values() if n}
+  near["x"] = tissue.xpos.numpy()[which], organ.xpos
+  for name in ("force", "tip_force"):
+    near[name] = found[name], getattr(needle, name)
+  for name, (values, expected) in near.items():
+    for row in values:
+      atol = limit if name.endswith("force") else 1e-5
+      np.testing.assert_allclose(row, expected, atol=atol, err_msg=name)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("free", [True, pytest.param(False, marks=SLOW)])
+def test_a_needle_goes_through_a_sheet_and_back_as_under_the_plugin(device, free):
+  """It dents the sheet, pierces it, slides in its hole, and is drawn out again."""
+  model, data, organ, worlds = scene(device, free=free, **COARSE)
+  seen = []
+  for k in drive(model, data, worlds, [0.85, -0.3]):
+    if k % 10 == 9:
+      compare(organ, worlds, 5e-4)
+      (needle,) = organ.needles
+      seen.append((bool(needle.touches), len(needle.holes)))
+  assert {(True, 0), (False, 1)} <= set(seen)
+  assert not organ.pinholes
+  assert not worlds.failures.numpy().any()
+
+
+@SLOW
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("windows", [False, True])
+def test_a_needle_goes_through_a_solid_as_under_the_plugin(device, windows):
+  tools = {"tools": ["needle"]} if windows else False
+  given = {"solid": True, "free": True, "windows": tools}
+  model, data, organ, worlds = scene(device, **given)
+  for k in drive(model, data, worlds, [2.4], 12.0):
+    if k % 20 == 19:
+      compare(organ, worlds, 1e-3)
+  assert len(organ.needles[0].holes) > 8
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_world_goes_on_where_a_state_says(device):
+  """There and back, beside one that has no hole, and after a reset."""
+  model, data, organ, worlds = scene(device, free=True, **COARSE)
+  for _ in drive(model, data, None, [1.0]):
+    pass
+  assert organ.pinholes
+  worlds.set_state(1, data)
+  for _ in drive(model, data, worlds, [1.1]):
+    pass
+  compare(organ, worlds, 5e-4, slice(1, 2))
+  assert worlds.organ("organ").needles.count.numpy().tolist() == [[0], [1]]
+  other = mujoco.MjData(model)
+  worlds.get_state(1, other)
+  mujoco.mj_forward(model, other)
+  (hole,) = palpate.Organ(model, other, "organ").pinholes
+  np.testing.assert_allclose(hole.rest, organ.pinholes[0].rest, atol=1e-7)
+  worlds.reset(np.array([False, True]))
+  assert not worlds.organ("organ").needles.count.numpy().any()
+  worlds.start(other)
+  worlds.reset(np.array([True, False]))
+  assert worlds.organ("organ").needles.count.numpy().tolist() == [[1], [0]]
+
+
+@SLOW
+@pytest.mark.parametrize("device", DEVICES)
+def test_worlds_have_walls_of_their_own(device):
+  """What piercing takes goes by the thickness of each, as under the plugin."""
+  thick = one.THICK * np.array([0.7, 1.2])
+  worlds = palpate.batch.make(one.scene(free=True, **COARSE), 2, device)
+  worlds.organ("organ").configure(thickness=thick)
+  for k, each in enumerate(thick):
+    model, data, organ = one.load(one.scene(free=True, **COARSE))
+    organ.configure(thickness=each)
+    for _ in drive(model, data, None if k else worlds, [1.2]):
+      pass
+    compare(organ, worlds, 5e-4, slice(k, k + 1))
+
+
+def test_needles_on_the_cpu_are_those_of_the_plugin():
+  model, data, organ, worlds = scene("cpu", **COARSE)
+  for _ in drive(model, data, worlds, [0.9]):
+    pass
+  assert organ.pinholes
+  compare(organ, worlds, 1e-6)
+
+
+def test_an_organ_without_needles_says_so():
+  worlds = palpate.batch.make(mujoco.MjSpec.from_string(press(subdivisions=1)), 1, "cpu")
+  with pytest.raises(ValueError, match="nothing goes through it, expected the key needles"):
+    worlds.organ("organ").needles  # noqa: B018
