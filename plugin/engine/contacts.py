@@ -1,4 +1,4 @@
-"""Contacts with an organ: weights of corners, stiffness, sliding; see `coupling/contact_*.h`.
+"""Contacts with an organ: weights of corners, stiffness, sliding; see `native/contact/`.
 
 MuJoCo 3.17 weighs the corners of a touched triangle by inverse distance: forces are off and
 flicker where a tool presses. MuJoCo 4.0 has it right. Both part what slides.
@@ -149,7 +149,7 @@ CONSTANTS = (
   }
 )
 weigh, lift = (
-  kernel(name, "coupling/contact_weights.h", Weights, CONSTANTS) for name in ("weigh", "lift")
+  kernel(name, "contact/contact_weights.h", Weights, CONSTANTS) for name in ("weigh", "lift")
 )
 
 

@@ -1,6 +1,6 @@
 """Rows of an organ's contacts: their stiffness, the gaps of sliding contacts, and their forces.
 
-Contacts that slide stay closed, see `keep_closed` of coupling/contact_weights.h, which widens the
+Contacts that slide stay closed, see `keep_closed` of contact/contact_weights.h, which widens the
 gap of a contact by D mu |v| over its stiffness, D the damping of its rows. A gap is in the
 normal's reference acceleration as stiffness times gap, and a row of friction has -D v there: so
 what the gap adds follows from those rows.
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
   from ..organs import Organ
 
 _ASKED, _SHARE, _FIRM = (wp.constant(k) for k in (TISSUE.asked, TISSUE.share, TISSUE.firm))
-# Tools under which contacts yield by what the mesh cannot, see coupling/series_compliance.h.
+# Tools under which contacts yield by what the mesh cannot, see contact/series_compliance.h.
 _SMALL = tuple(int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
                for name in ("SPHERE", "CAPSULE", "CYLINDER"))  # fmt: skip
 # What of these fields are those of `Patch`.
@@ -117,7 +117,7 @@ def _has_rows(p: Pressed, c: int):
 
 @wp.func
 def _firm_up(p: Pressed, world: int, c: int):
-  """Makes a contact as firm as under the plugin, see coupling/contact_stiffness.h.
+  """Makes a contact as firm as under the plugin, see contact/contact_stiffness.h.
 
   Rows of friction have the normal's R times what mujoco_warp says, so they yield with it. Returns
   what is off its gap, as an acceleration [m/s^2].
@@ -164,7 +164,7 @@ def parting(
 ):
   """Returns how fast a contact of n dimensions that slides is braked, times friction [m/s^2].
 
-  See `parting` of coupling/contact_rows.h.
+  See `parting` of contact/contact_rows.h.
   """
   square = float(0.0)  # noqa: UP018 - a variable to Warp
   for r in range(n - 1):

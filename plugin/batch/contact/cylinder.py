@@ -60,7 +60,7 @@ def _within(x: wp.vec3, a: wp.vec3, b: wp.vec3, d: wp.vec3, n: wp.vec3):
 def _under_end(size: wp.vec3, radius: float, a: wp.vec3, b: wp.vec3, d: wp.vec3):
   """Returns how much of a triangle lies under a flat end, its middle and gap, and the way out.
 
-  It is `under_end` of coupling/contact_weights.h, in the cylinder's frame.
+  It is `under_end` of contact/contact_weights.h, in the cylinder's frame.
   """
   out = wp.where(a[2] + b[2] + d[2] < 0.0, -1.0, 1.0)
   level = wp.abs(wp.normalize(wp.cross(b - a, d - a))[2]) >= _LEVEL

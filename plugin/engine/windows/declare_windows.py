@@ -108,7 +108,7 @@ def _windows(
   body, dofadr, qposadr, offset, turn = _slots(m, name, config.window, flex, place)
   elem_num = int(mjstruct.view(m.flex_elemnum, m.nflex, np.int32)[flex])
   # At rest the window stands on a patch of its own: its bodies move there, so that qpos0 fits.
-  # The last slot stays free; a patch of n nodes has up to 2 n - 4 triangles: `coupling/proxy.h`.
+  # The last slot stays free; a patch of n nodes has up to 2 n - 4 triangles: `windows/proxy.h`.
   room = min(len(body) - 1, elem_num // 2 + 2)
   home = _home_slots(mesh.elem, mesh.nouter, len(body), room)
   used = home >= 0

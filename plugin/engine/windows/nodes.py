@@ -41,7 +41,7 @@ class Nodes:
 
 
 commit, move_slots, enter, push_slots, push_impulses, search, report = coupling.kernels(
-  "coupling/window_nodes.h",
+  "windows/window_nodes.h",
   Nodes,
   *("commit", "move_slots", "enter", "push_slots", "push_impulses", "search", "report"),
 )

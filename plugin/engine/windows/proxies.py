@@ -91,7 +91,7 @@ class Slots:
 
 
 place, gather, scatter, leave, choose, foresee = coupling.kernels(
-  "coupling/proxies.h",
+  "windows/proxies.h",
   Slots,
   *("place", "gather_slots", "scatter_slots", "leave_slots", "choose", "foresee"),
 )
@@ -122,7 +122,7 @@ class Reshaping:
   near: flags("nvert")  # scratch; 0 between calls
 
 
-(_reshape,) = coupling.kernels("coupling/proxies.h", Reshaping, "reshape_slots")
+(_reshape,) = coupling.kernels("windows/proxies.h", Reshaping, "reshape_slots")
 
 
 def scratch(nvert: int, nslot: int) -> dict[str, wp.array]:

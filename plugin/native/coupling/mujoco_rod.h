@@ -1,6 +1,6 @@
 // A rod among MuJoCo's own dofs, in MuJoCo's memory.
 #pragma once
-#include "coupling/contact_rows.h"
+#include "contact/contact_rows.h"
 #include "coupling/rod.h"
 
 AS_WRITTEN

@@ -1,6 +1,6 @@
 // Batches: how much an organ's contacts yield under each of its tools. A thread has a tool of a world.
 #pragma once
-#include "coupling/series_compliance.h"
+#include "contact/series_compliance.h"
 #include "coupling/worlds.h"
 
 namespace palpate {

@@ -1,6 +1,6 @@
 // Windows: which nodes the slots stand on in the next step.
 #pragma once
-#include "coupling/proxy.h"
+#include "windows/proxy.h"
 
 namespace palpate {
 

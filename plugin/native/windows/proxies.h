@@ -1,9 +1,9 @@
 // Windows: the slots' side, on the CPU beside MuJoCo: what it tells the nodes, and what of their
 // answer it gives to MuJoCo.
 #pragma once
-#include "coupling/assign_proxies.h"
-#include "coupling/window_mesh.h"
-#include "coupling/sleep.h"
+#include "windows/assign_proxies.h"
+#include "windows/window_mesh.h"
+#include "windows/sleep.h"
 #include "core/triangle.h"
 
 namespace palpate {

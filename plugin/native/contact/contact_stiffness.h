@@ -1,8 +1,8 @@
 // How firm contacts are: as firm as their tissue asks for and a step can bear; MuJoCo's grow softer as
 // nodes grow lighter.
 #pragma once
-#include "coupling/contact_rows.h"
-#include "coupling/series_compliance.h"
+#include "contact/contact_rows.h"
+#include "contact/series_compliance.h"
 
 namespace palpate {
 

@@ -6,7 +6,7 @@
 // friction times how fast it is braked. On light nodes that lifts a tool off within a step, and the
 // force flickers.
 #pragma once
-#include "coupling/contact_stiffness.h"
+#include "contact/contact_stiffness.h"
 
 namespace palpate {
 

@@ -1,6 +1,6 @@
 // Windows: what is taken from MuJoCo's step, and whether the organ falls asleep after it.
 #pragma once
-#include "coupling/proxy.h"
+#include "windows/proxy.h"
 
 namespace palpate {
 
