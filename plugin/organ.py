@@ -217,8 +217,26 @@ class Organ:
   @property
   def needles(self) -> tuple[Needle, ...]:
     """What goes through it (key `needles`): whether it is in the tissue, its force and energy."""
-    x = self._organ.origin + (self._organ.mesh.rest + self._deformation) @ self._organ.frame.T
-    return tuple(self._space.needles.read(x))
+    return tuple(self._space.needles.read(self._places()))
+
+  def _places(self) -> np.ndarray:
+    """Returns places of all vertices, those inside of a solid too, in the world [m]."""
+    return self._organ.origin + (self._organ.mesh.rest + self._deformation) @ self._organ.frame.T
+
+  def sew(self, needle: str):
+    """Takes a needle's thread as sewn: makes holes where it goes through the surface now.
+
+    Lay the thread through it before, see `Thread.lay`. Holes that the needle had are forgotten.
+
+    Args:
+      needle: name of its body
+
+    Raises:
+      ValueError: the organ does not know the needle, that has no thread, or the thread goes through
+        nowhere, or too often; the message says what is allowed.
+    """
+    mujoco.mj_kinematics(self.model, self.data)
+    self._space.needles.sew(needle, self._places())
 
   @property
   def pinholes(self) -> tuple[Pinhole, ...]:

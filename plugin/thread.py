@@ -33,6 +33,7 @@ def add_thread(
   pin: Sequence[int] = (),
   rgba: Sequence[float] = _RGBA,
   contact: Mapping[str, object] | None = None,
+  bead: float = 0.0,
   **config,
 ) -> mujoco.MjsFlex:
   """Adds a surgical thread to a spec, in a body of its name, as a <flexcomp> of dim 1 in MJCF.
@@ -52,6 +53,8 @@ def add_thread(
     pin: nodes that do not move; two next to each other hold the direction and turn of their edge
     rgba: colour
     contact: attributes of <contact> that are not as usual
+    bead: radius of what is at its last node, such as a clip or a knot: it touches nothing, but does
+      not go through a needle's hole that is narrower; 0 for none [m]
     **config: keys of a rod that are not the material's: young, poisson, bend, twist, strength
 
   Returns:
@@ -88,6 +91,10 @@ def add_thread(
   body = where.add_body(name=name, pos=pos, quat=quat)
   mass = suture.density * np.pi * radius**2 * length.sum() / len(nodes)
   placed = authoring.add_nodes(spec, body, nodes, pins, mass, texts)
+  if bead:
+    spec.body(f"{name}_{len(nodes) - 1}").add_geom(
+      size=[bead, 0, 0], mass=0, contype=0, conaffinity=0, rgba=rgba
+    )
   elem = np.arange(len(length))[:, None] + (0, 1)
   return windows.make_flex(spec, name, *placed, elem, **look)
 
@@ -124,6 +131,34 @@ class Thread:
     out, at = organ.rest.copy(), organ.qposs.reshape(-1, 3)
     out[organ.free] += self.data.qpos[at] - self.model.qpos0[at]
     return out
+
+  def lay(self, points: np.ndarray):
+    """Puts it at rest along a line, its edges as long as at rest.
+
+    Args:
+      points: of the line, from its first node on, in the world [m]; beyond it the thread goes on
+        straight                                                       (n, 3)
+
+    Raises:
+      ValueError: it has pinned nodes.
+    """
+    organ, line = self._space.organ, np.asarray(points, dtype=float)
+    if not organ.free.all():
+      raise ValueError(f"thread {self.name!r} has pinned nodes, expected one that is free")
+    length = np.linalg.norm(np.diff(organ.rest, axis=0), axis=1)
+    last = line[-1] - line[-2]
+    line = np.concatenate([line, line[-1:] + length.sum() / np.linalg.norm(last) * last])
+    places, k = [line[0]], 0
+    for far in length:  # each edge is a chord of the line
+      while np.linalg.norm(line[k + 1] - places[-1]) < far:
+        k += 1
+      way, off = line[k + 1] - line[k], line[k] - places[-1]
+      a, b, c = way @ way, way @ off, off @ off - far**2
+      places.append(line[k] + (np.sqrt(b * b - a * c) - b) / a * way)
+    self._space.plugin_state[:] = 0.0
+    at = organ.qposs.reshape(-1, 3)
+    self.data.qpos[at] = self.model.qpos0[at] + (places - organ.origin) @ organ.frame - organ.rest
+    self.data.qvel[organ.dofs] = 0.0
 
   @property
   def length(self) -> float:

@@ -232,7 +232,7 @@ class Ties:
 
   def __init__(self):
     kinds: dict[str, tuple[Any, Any]] = {"tie_count": (1, int), "tie_edge": (MOST_TIES, int)}
-    kinds["tie_value"] = (MOST_TIES, 13), wp.float64
+    kinds["tie_value"] = (MOST_TIES, len(layout.TIE)), wp.float64
     self.arrays = {n: wp.zeros(s, dtype=kind, device="cpu") for n, (s, kind) in kinds.items()}
     self.aims: dict[Any, Callable[[], None]] = {}
     self.lead: Callable[[int], None] = lambda instance: None

@@ -210,6 +210,18 @@ PIERCE = Numbers(
   ("clear", 1, "m", "how far a tip is off its seat before it may skid"),
   ("margin", 1, "m", "before its first hole, from where on it has no contacts"),
   ("close", 1, "m", "from a hole, to where its thread has none"),
+  ("stop", 1, "-", "whether a bead at the thread's end is wider than the hole"),
+)
+
+# What holds a thread at a place, see `tissue/rod_ties.h`; in the slides' axes.
+TIE = Numbers(
+  "TIE",
+  ("part", 1, "-", "where on its edge it is held, as a share"),
+  ("aim", 3, "m", "where what holds it will be"),
+  ("stiffness", 1, "N/m", "of the spring"),
+  ("friction", 1, "N", "what that bears along the thread"),
+  ("along", 3, "-", "which way that is"),
+  ("force", 3, "N", "on the thread, of the step"),
 )
 
 # The last numbers of the plugin state of a windowed organ.
@@ -226,7 +238,7 @@ TAIL = Numbers(
 
 TABLES = (
   FLAG, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, BOND, BLADE, LAW,
-  HOLE, NEEDLE, PIERCE, TAIL,
+  HOLE, NEEDLE, PIERCE, TIE, TAIL,
 )  # fmt: skip
 CONSTANTS = {
   "TRAIL": TRAIL,

@@ -97,7 +97,7 @@ class Rod:
   row_value: doubles("nrow", 9)  # J of their dofs; J a of other bodies less aref; D; friction
   tie_count: ints(1)  # what holds it, see `coupling.Ties`
   tie_edge: ints("ntie")  # the edge that is held
-  tie_value: doubles("ntie", 13)  # see `rod_ties.h`
+  tie_value: doubles("ntie", len(layout.TIE))  # see TIE
   own: RodState
 
 
@@ -260,7 +260,7 @@ def scratch(n: int) -> dict[str, np.ndarray]:
     row_value=np.zeros((rows, 9)),
     tie_count=np.zeros(1),
     tie_edge=np.zeros(coupling.MOST_TIES),
-    tie_value=np.zeros((coupling.MOST_TIES, 13)),
+    tie_value=np.zeros((coupling.MOST_TIES, len(layout.TIE))),
   )
 
 

@@ -17,7 +17,7 @@ from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import doubles, ints, struct
 
 from ..engine import contacts, coupling
-from ..engine.layout import HOLE, HOLES, NEEDLE, PIERCE
+from ..engine.layout import HOLE, HOLES, NEEDLE, PIERCE, TIE
 from ..engine.model import declare, flexes, mjstruct
 from .declare_attachments import find_body, most
 from .host import Bodies, Host, Input, Nodes, kernels
@@ -33,7 +33,7 @@ _ENDS = ("swage", "tip")
 # As in the header.
 _POINTS = HOLES + 1
 _TOUCHING, _INSIDE = 1, 2
-_WITHIN = 1
+_INTO, _WITHIN, _OUT, _THROUGH = range(4)
 
 
 @struct
@@ -91,7 +91,7 @@ class Held:
   first: ints(1)  # the first of these
   tie_count: ints(1)  # see `coupling.Ties`
   tie_edge: ints("ntie")
-  tie_value: doubles("ntie", 13)
+  tie_value: doubles("ntie", len(TIE))
 
 
 _enter, _act, _keep = kernels(
@@ -247,6 +247,7 @@ class Needles(Force):
       out[:, k, PIERCE.clear] = self._slit[k]
       out[:, k, PIERCE.margin] = self._margin[k]
       out[:, k, PIERCE.close] = self._threads[k]["close"]
+      out[:, k, PIERCE.stop] = 2 * self._threads[k]["bead"] > self._slit[k]
     return out
 
   @property
@@ -305,6 +306,43 @@ class Needles(Force):
     for k, held in self._held.items():
       coupling.ties(self.host.data, self._threads[k]["flex"]).lead(self.host.instance)
       self.host.launch(_feel, held, arg=k)
+
+  def sew(self, name: str, x: np.ndarray):
+    """Makes holes where a needle's thread goes through the surface, of one world.
+
+    Args:
+      name: of the needle's body
+      x: places of the organ's vertices now, in the world [m]  (nvert, 3)
+
+    Raises:
+      ValueError: there is no such needle, it has no thread, or that goes through nowhere, or too
+        often.
+    """
+    host, what = self.host, f"organ {self.host.organ.name!r}: needle {name!r}"
+    if name not in self.names:
+      raise ValueError(f"{what} is none of its own, expected one of {', '.join(self.names)}")
+    k = self.names.index(name)
+    nodes = self._threads[k]["node"]
+    if not len(nodes):
+      raise ValueError(f"{what} has no thread, expected one that `add_needle` has joined")
+    line = np.stack([host.body_frame(int(body))[1] for body in nodes])
+    rows = _crossings(line, x[host.organ.mesh.elem])
+    if not 0 < len(rows) <= HOLES:
+      raise ValueError(
+        f"{what} has a thread that goes through the surface {len(rows)} times, expected 1 to "
+        f"{HOLES}"
+      )
+    length = self._threads[k]["edges"][:-1, 0]
+    before = np.r_[0.0, np.cumsum(length)]
+    state = self.fields.state.numpy()[0, k]
+    state[:] = 0.0
+    state[NEEDLE.count] = len(rows)
+    solid = host.config.elements == "solid"
+    for h, (edge, part, elem, v, w, against) in enumerate(sorted(rows, reverse=True)):
+      hole = state[NEEDLE.hole + len(HOLE) * h :][: len(HOLE)]
+      hole[HOLE.kind] = (_INTO if against else _OUT) if solid else _THROUGH
+      hole[HOLE.elem : HOLE.elem + 3] = elem, v, w
+      hole[HOLE.thread] = before[edge] + part * length[edge]
 
   def refresh(self, tissue: np.ndarray | None = None, thickness: Any = None):
     """Takes the material that there is now.
@@ -413,12 +451,13 @@ def _strand(host: Host, needle: int) -> dict[str, Any]:
   Returns:
     flex, or -1; body of each node (n,) and its place there [m] (n, 3); rest length and stiffness of
     the edge to the next node (n, 2); frame (3, 3) and origin (3,) of its slides;
-    friction; how far from a hole it touches nothing
+    friction; how far from a hole it touches nothing; radius of the largest geom at its end [m]
   """
   m, none = host.m, np.zeros((0, 3))
   out = {"flex": -1, "node": none[:, 0], "local": none, "edges": none[:, :2], "friction": 0.0,
-         "close": 0.0}  # fmt: skip
+         "close": 0.0, "bead": 0.0}  # fmt: skip
   first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  size = mjstruct.view(m.geom_size, (m.ngeom, 3))[:, 0]
   body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
   joined = {
     int(pair[1 - side])
@@ -447,6 +486,9 @@ def _strand(host: Host, needle: int) -> dict[str, Any]:
       "frame": frame,
       "origin": origin,
       "close": _BESIDE * (_radius(host) + thick),
+      "bead": float(
+        size[mjstruct.view(m.geom_bodyid, m.ngeom, np.int32) == body[mine][-1]].max(initial=0.0)
+      ),
       "friction": float(mjstruct.view(m.flex_friction, (m.nflex, 3))[flex, 0]),
     }
   return out
@@ -462,18 +504,36 @@ def _pairs(m) -> np.ndarray:
   return np.stack(ids, axis=1)
 
 
-def _goes_through(line: np.ndarray, mesh: Mesh) -> bool:
-  """Returns whether a line through points [m], (n, 3), goes through a surface or is inside."""
-  x = mesh.rest[mesh.elem]
+def _crossings(line: np.ndarray, x: np.ndarray) -> list[tuple[int, float, int, float, float, bool]]:
+  """Returns where a line goes through triangles.
+
+  Args:
+    line: its points [m]                   (n, 3)
+    x: corners of the triangles [m]        (nelem, 3, 3)
+
+  Returns:
+    of each place the line's edge and the share of it, the triangle, the shares of its last two
+    corners, and whether one who comes from the line's end goes against its normal
+  """
+  out = []
   e, g = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
-  for start, stop in itertools.pairwise(line):
+  for k, (start, stop) in enumerate(itertools.pairwise(line)):
     way, r = stop - start, start - x[:, 0]
     p, q = np.cross(way, g), np.cross(r, e)
     det = (e * p).sum(axis=1)
     det = np.where(np.abs(det) > 0, det, np.nan)
     v, w, t = (r * p).sum(axis=1) / det, (q @ way) / det, (g * q).sum(axis=1) / det
-    if ((v >= 0) & (w >= 0) & (v + w <= 1) & (t >= 0) & (t <= 1)).any():
-      return True
+    found = (v >= 0) & (w >= 0) & (v + w <= 1) & (t >= 0) & (t <= 1)
+    for i in np.flatnonzero(found).tolist():
+      out.append((k, float(t[i]), i, float(v[i]), float(w[i]), bool(det[i] < 0)))
+  return out
+
+
+def _goes_through(line: np.ndarray, mesh: Mesh) -> bool:
+  """Returns whether a line through points [m], (n, 3), goes through a surface or is inside."""
+  x = mesh.rest[mesh.elem]
+  if _crossings(line, x):
+    return True
   if not mesh.closed:
     return False
   a, b, c = np.moveaxis(x - line[0], 1, 0)  # solid angle (van Oosterom and Strackee 1983)

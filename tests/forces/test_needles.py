@@ -268,36 +268,98 @@ def test_a_thread_slides_through_a_hole_as_around_a_capstan():
   assert palpate.Thread(model, data, "suture").error is None
 
 
-def test_a_stitch_draws_a_cut_together():
-  """A thread through both sides of a cut draws them together as its end is pulled."""
-  nodes = 28
-  spec = scene(nodes=nodes, spare=20, tension=30.0, young=1e5, needles=f"needle {ENERGY} 10")
-  hand = spec.worldbody.add_body(name="end", mocap=True, pos=spec.body(f"suture_{nodes - 1}").pos)
-  spec.add_equality(
-    name="end", type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=hand.name,
-    name2=f"suture_{nodes - 1}", active=False, data=np.zeros(mujoco.mjNEQDATA),
-  )  # fmt: skip
+def test_a_needle_draws_its_thread_through_both_lips():
+  """Over a cut that gapes it goes in on one side and out on the other."""
+  spec = scene(nodes=28, spare=20, tension=30.0, young=1e5, needles=f"needle {ENERGY} 10")
   model, data, organ = load(spec)
   organ.cut([(0, y, 0) for y in np.linspace(-0.008, 0.008, 12)])
   for _ in range(100):
     mujoco.mj_step(model, data)
-  rest = organ.xpos0
-  lips = np.flatnonzero((np.abs(rest[:, 0]) < 1e-4) & (np.abs(rest[:, 1]) < 5e-3))
-  opened = np.ptp(organ.xpos[lips, 0])
+  lips = np.flatnonzero(np.abs(organ.xpos0[:, 0]) < 1e-4)
+  assert np.ptp(organ.xpos[lips, 0]) > 3e-3
   drive(model, data, organ, [5.9])
   first, second = organ.pinholes
   assert first.thread and second.thread
   assert first.rest[0] > 3e-3 and second.rest[0] < -3e-3
   assert first.along < second.along
-  end = data.body(f"suture_{nodes - 1}").xpos.copy()
-  data.eq_active[-1] = 1
-  for k in range(950):  # the needle holds the other end
-    data.mocap_pos[0] = end + 3e-5 * k * np.array((-0.8, 0, 0.6))
-    mujoco.mj_step(model, data)
-  assert organ.error is None
-  assert len(organ.pinholes) == 2
-  assert opened > 3e-3
-  assert np.ptp(organ.xpos[lips, 0]) < 0.8 * opened
+
+
+def seam(count, bite, pitch, depth):
+  """Returns a running stitch across x = 0, from where the needle leaves it to where it begins."""
+  turn = np.linspace(0.0, 2 * count - 1, 160 * count)  # odd turns are above, where it goes on
+  y = pitch * (turn // 2 + np.maximum(turn % 2 - 1, 0.0) - (count - 1) / 2)
+  across, up = bite * np.cos(np.pi * turn), -depth * np.sin(np.pi * turn)
+  points = np.stack([across, y, up], axis=1)
+  start, end = points[0] + (0, 0, 2e-3), points[-1] + (0, 8e-3, 0.02)
+  return np.concatenate([[start], points, [end]])[::-1]
+
+
+def halves(count=5, bite=5e-3, sewn=True):
+  """Returns a sheet in two halves that a thread joins, the left one held, and the right one's rim.
+
+  The thread ends in a bead at its first hole; behind the last one the needle holds it.
+  """
+  spec, line, edge, size = mujoco.MjSpec(), seam(count, bite, 8e-3, 5e-4), 1.5e-3, 0.04
+  spec.option.timestep, spec.option.gravity = STEP, (0, 0, 0)
+  along = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
+  nodes = int(0.93 * along / edge)  # edges are chords of the line
+  straight = line[0] + edge * np.arange(nodes)[:, None] * (0, 0, 1)
+  palpate.add_thread(spec, straight, "suture", strength=0, bead=1e-3)
+  spec.worldbody.add_body(name="hand", pos=line[0] + (0, RADIUS, 0))
+  palpate.add_needle(spec, length=LENGTH, parent="hand", thread="suture")
+  surface, rim = sheet(size=size)
+  side = surface[0][rim, 0] / size
+  palpate.add_organ(
+    spec, surface, pin=rim[side < -0.499], spare=40, needles="needle 800 15", device="cpu",
+    **SHEET | {"damping": 0.01},
+  )  # fmt: skip
+  model, data, organ = load(spec)
+  organ.cut([(0, y, 0) for y in np.linspace(-size / 2, size / 2, 20)])
+  thread = palpate.Thread(model, data, "suture")
+  if sewn:
+    thread.lay(line)
+    organ.sew("needle")
+  return model, data, organ, thread, rim[side > 0.499]
+
+
+def test_a_running_stitch_holds_a_cut_closed():
+  """Five stitches bear 0.6 N that pull two halves apart; without them these part.
+
+  The tension of all strands across the cut is the pull.
+  """
+  force = 0.6
+  for sewn in (False, True):
+    model, data, organ, thread, rim = halves(sewn=sewn)
+    lips = np.flatnonzero((np.abs(organ.xpos0[:, 0]) < 1e-6) & (np.abs(organ.xpos0[:, 1]) < 0.015))
+    for k in range(450 if sewn else 100):
+      for v in rim:
+        data.body(f"organ_{v}").xfrc_applied[0] = force / len(rim) * min(1.0, k / 300)
+      mujoco.mj_step(model, data)
+    pairs = organ.xpos[lips][np.argsort(organ.xpos0[lips, 1], kind="stable"), 0].reshape(-1, 2)
+    gap = np.abs(np.diff(pairs, axis=1))
+    if not sewn:
+      assert gap.min() > 0.01
+      continue
+    assert organ.error is None and thread.error is None
+    assert len(organ.pinholes) == 10
+    assert gap.max() < 1e-3
+    x, tension = thread.positions, thread.tension
+    ways = np.diff(x, axis=0)
+    crosses = x[1:, 0] * x[:-1, 0] < 0
+    held = tension[crosses] * np.abs(ways[crosses, 0]) / np.linalg.norm(ways[crosses], axis=1)
+    assert len(held) == 9
+    assert held.sum() == pytest.approx(force, rel=0.01)
+
+
+def test_what_cannot_be_sewn_is_told():
+  for nodes, name, message in (
+    (0, "pin", "needle 'pin' is none of its own, expected one of needle"),
+    (0, "needle", "has no thread, expected one that `add_needle` has joined"),
+    (8, "needle", "goes through the surface 0 times, expected 1"),
+  ):
+    organ = load(scene(nodes=nodes))[2]
+    with pytest.raises(ValueError, match=message):
+      organ.sew(name)
 
 
 @pytest.mark.parametrize("windows", [False, True])

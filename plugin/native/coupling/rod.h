@@ -165,7 +165,7 @@ PALPATE void begin(const Host& host, double h) {
     host.note_rows();
   });
   const int status = step_rod(rod, h);
-  ties_energy(rod, rod.place.data, h, nullptr, nullptr);
+  ties_energy(rod, rod.place.data, nullptr, nullptr);
   const bool ok = status >= 0, touched = ok && rod.count.data[0] > 0;
   one_lane([&] { rod.status.data[0] = status; });
   if (!ok)  // holds still for this step instead of spreading the damage

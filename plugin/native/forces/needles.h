@@ -10,9 +10,9 @@
 // its thickness. Holes are held across the needle; along it each is dragged by friction, a force by length of the
 // needle in tissue (Okamura et al. 2004, doi:10.1109/TBME.2004.831542), that sticks or slips.
 //
-// Where the swage has gone through, a hole holds the thread by its nearest point: across it by a spring, along it by
-// friction, which bears T (exp(mu theta) - 1), T the smaller one of the tensions on both sides and theta the angle
-// between them (the capstan's law), and that by length.
+// Where the swage has gone through, a hole holds the thread by a spring to a place on it, which slips where it bears more
+// along the thread than friction: T (exp(mu theta) - 1), T the smaller one of the tensions on both sides and theta the
+// angle between them (the capstan's law), and that by length.
 //
 // Both ends are implicit. The tissue has the springs in its matrix and takes the needle to move on as it does, the
 // needle their part of its inertia in MuJoCo's: each end alone, which is stable whatever either weighs (for two
@@ -32,9 +32,10 @@ constexpr int POINTS = HOLES + 1;  // that hold a needle; the last is its tip
 constexpr double POINT = 0.1, CLEAR = 0.04;
 constexpr double SKIDS = 2.0;   // times its way along a needle that a tip is off its seat before it lets go
 constexpr double BELOW = 0.02;  // edges under the surface where a tip is in a solid
-constexpr int FASTEST = 8;  // edges that a thread slides through a hole in a step, at most
 constexpr int BESIDE = 2;  // edges from the one that is in a hole to those that tell how a thread turns there
-constexpr double SLOW = 1e-4;  // velocity below which a thread's friction is viscous, as in rods [m/s]
+constexpr double HAIRPIN = 0.2;  // least share of a thread's friction along the mean of its directions, where it turns back
+constexpr double ENDS = 1e-9;   // share of a thread, or of its last edge, that is its end
+constexpr double STOPS = 1e6;   // what a bead there bears at a hole [N]
 constexpr double TIGHT = 1e-9;  // of what tissue bears, to which a return mapping brings it
 constexpr double APART = 0.5;   // edges between holes in a solid, at least
 
@@ -143,10 +144,6 @@ struct Strand {
     const int b = f.node.data[first + n];
     const D3 p = load(f.mj.xpos.data + 3 * b) + turned(f.mj.xmat.data + 9 * b, load(f.local.data + 3 * (first + n)));
     return add_turned({0.0, 0.0, 0.0}, f.own.frame.data, p - load(f.own.origin.data));
-  }
-  PALPATE D3 vel(int n) const {
-    const int b = f.node.data[first + n];
-    return velocity_of(f, b, twist(f.mj, b, false), at(n));
   }
   PALPATE double tension(int e) const {
     const double T = f.edges.data[2 * (first + e) + 1] * (norm(at(e + 1) - at(e)) - edge(e));
@@ -306,7 +303,7 @@ PALPATE Sym across_and_along(double a, double b, D3 n) {
 // A hole's thread: the edge that is in it, the share of that, and how it is there. It turns by `angle` between edges
 // beside that, far enough for a thread that resists bending; the needle itself is what is before the first one. It slides along the mean of both, so that equal
 // tensions do not make it slide wherever on the edge it is.
-struct Passing { int edge; double part, angle; D3 at, vel, along; };
+struct Passing { int edge; double part, angle; D3 at, along; };
 
 template <class Fields>
 PALPATE Passing passing(const Fields& f, int i, const Arc& arc, double place) {
@@ -315,42 +312,13 @@ PALPATE Passing passing(const Fields& f, int i, const Arc& arc, double place) {
   const int e = out.edge = thread.find(place, out.part);
   const D3 from = thread.at(e), to = thread.at(e + 1), zero = {0.0, 0.0, 0.0};
   out.at = (1.0 - out.part) * from + out.part * to;
-  out.vel = (1.0 - out.part) * thread.vel(e) + out.part * thread.vel(e + 1);
   const int first = e > BESIDE ? e - BESIDE : 0, last = e + BESIDE + 2 < thread.count ? e + BESIDE : thread.count - 2;
   const D3 before = e ? unit_of(thread.at(first + 1) - thread.at(first)) : zero - arc.along(0.0);
   const D3 after = unit_of(thread.at(last + 1) - thread.at(last));
   const D3 both = before + after;
   out.angle = atan2(norm(cross(before, after)), dot(before, after));
-  out.along = norm(both) > 0.1 ? unit_of(both) : unit_of(to - from);
+  out.along = norm(both) > 1e-6 ? unit_of(both) : unit_of(to - from);
   return out;
-}
-
-// Follows a thread that has slid through a hole: to where it is beside the tissue, on that edge or
-// some beside it.
-template <class Fields>
-PALPATE void follow_thread(const Fields& f, int i, const Arc& arc, double* s, int n) {
-  const auto thread = strand_of(f, i);
-  double& place = hole(s, n)[HOLE_THREAD];
-  const Passing by = passing(f, i, arc, place);
-  const D3 p = seat_of_hole(f, s, n).at;
-  double start = 0.0;
-  for (int e = 0; e < by.edge; ++e) start += thread.edge(e);
-  for (int e = by.edge, turns = 0; turns < FASTEST; ++turns) {
-    const D3 way = thread.at(e + 1) - thread.at(e);
-    const double ahead = dot(p - thread.at(e), by.along), whole = dot(way, by.along);
-    const double share = whole > 0.1 * norm(way) ? ahead / whole : by.part;
-    place = start + (share < 0.0 ? 0.0 : share > 1.0 ? 1.0 : share) * thread.edge(e);
-    if (share > 1.0 && e + 2 < thread.count)
-      start += thread.edge(e++);
-    else if (share < 0.0 && e > 0)
-      start -= thread.edge(--e);
-    else
-      break;
-  }
-  if (place > 0.0) return;  // else on the needle again, if that is there
-  const double there = arc.nearest(p);
-  if (norm(arc.place(there < 0.0 ? 0.0 : there) - p) < thread.edge(0)) place = hole(s, n)[HOLE_SLIP] = 0.0;
-  else place = 2.0 * thread.length();
 }
 
 // What friction of a thread in a hole bears along it, of the difference of the tensions on both sides of the edge that is
@@ -360,22 +328,46 @@ PALPATE double thread_friction(const Fields& f, int i, const Passing& by, const 
   const double* law = f.law.data + PIERCE_LENGTH * i;
   const auto thread = strand_of(f, i);
   const int e = by.edge;
-  const double back = e + 2 == thread.count ? 0.0 : thread.tension(e + 1), pull = thread.tension(e ? e - 1 : 0);
+  const bool last = e + 2 == thread.count;
+  if (law[PIERCE_STOP] > 0.0 && last && by.part > 1.0 - ENDS && dot(by.at - seat.at, by.along) < 0.0) return STOPS;
+  const double back = last ? 0.0 : thread.tension(e + 1), pull = thread.tension(e ? e - 1 : 0);
   const bool in = kind_of(s, n) == INTO && n + 1 < (int)s[NEEDLE_COUNT], out = kind_of(s, n) == OUT && n > 0;
   const double length = in || out ? 0.5 * norm(seat.at - seat_of_hole(f, s, in ? n + 1 : n - 1).at) : law[PIERCE_WALL];
   const double most = (pull < back ? pull : back) * (exp(law[PIERCE_CAPSTAN] * by.angle) - 1.0);
-  return cos(0.5 * by.angle) * (most + law[PIERCE_FRICTION] * length);
+  const double share = cos(0.5 * by.angle);
+  return (share > HAIRPIN ? share : HAIRPIN) * (most + law[PIERCE_FRICTION] * length);
+}
+
+// Follows a thread that has slid through a hole: the place that holds it goes on along the thread by as much as its spring
+// is longer than friction bears.
+template <class Fields>
+PALPATE void follow_thread(const Fields& f, int i, const Arc& arc, double* s, int n) {
+  const auto thread = strand_of(f, i);
+  double& place = hole(s, n)[HOLE_THREAD];
+  const Passing by = passing(f, i, arc, place);
+  const Seat seat = seat_of_hole(f, s, n);
+  const D3 p = seat.at;
+  const double off = dot(by.at - p, by.along);
+  const double slack = thread_friction(f, i, by, seat, s, n) / f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
+  if (fabs(off) <= slack) return;
+  place -= off > 0.0 ? off - slack : off + slack;
+  const double whole = thread.length();
+  place = place < whole ? place : whole;
+  if (place > 0.0) return;  // else on the needle again, if that is there
+  const double there = arc.nearest(p);
+  if (norm(arc.place(there < 0.0 ? 0.0 : there) - p) < thread.edge(0)) place = hole(s, n)[HOLE_SLIP] = 0.0;
+  else place = 2.0 * thread.length();
 }
 
 // Holds a thread in a hole: by the force that its step has found, and less as the tissue then follows it.
 template <class Fields>
-PALPATE void tie_thread(const Fields& f, Thread t, int i, int n, const Arc& arc, double weight, double h, double* s) {
+PALPATE void tie_thread(const Fields& f, Thread t, int i, int n, const Arc& arc, double weight, double* s) {
   const Seat seat = seat_of_hole(f, s, n);
   const Passing by = passing(f, i, arc, hole(s, n)[HOLE_THREAD]);
-  const double slides = fabs(dot(by.vel - seat.vel, by.along));
-  const double drag = thread_friction(f, i, by, seat, s, n) / (slides > SLOW ? slides : SLOW);
+  const double most = thread_friction(f, i, by, seat, s, n);
+  const bool sticks = f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS] * fabs(dot(by.at - seat.at, by.along)) < most;
   const D3 force = load(f.pull.data + 3 * (POINTS * i + n));
-  tie(f, t, POINTS * i + n, seat, by.at, force, across_and_along(weight, h * drag, by.along), false);
+  tie(f, t, POINTS * i + n, seat, by.at, force, across_and_along(weight, sticks ? weight : 0.0, by.along), false);
 }
 
 // Closes holes that the tip has been drawn out of, and lets go of those that the swage has left, or hands them to the
@@ -383,12 +375,13 @@ PALPATE void tie_thread(const Fields& f, Thread t, int i, int n, const Arc& arc,
 template <class Fields>
 PALPATE void close_holes(const Fields& f, int i, const Arc& arc, double* s) {
   const auto thread = strand_of(f, i);
+  const bool stops = f.law.data[PIERCE_LENGTH * i + PIERCE_STOP] > 0.0;
   int count = (int)s[NEEDLE_COUNT], kept = 0;
   while (count > 0 && place_of_hole(f, arc, s, count - 1) > arc.length) --count;
   for (int h = 0; h < count; ++h) {
     double* from = hole(s, h);
     const double place = place_of_hole(f, arc, s, h);
-    if (on_thread(s, h) ? from[HOLE_THREAD] > (1.0 - 1e-9) * thread.length()
+    if (on_thread(s, h) ? from[HOLE_THREAD] > (stops ? 1.0 + ENDS : 1.0 - ENDS) * thread.length()
                         : place < 0.0 && (!thread.count || kind_of(s, h) == WITHIN))
       continue;
     if (!on_thread(s, h) && place < 0.0) from[HOLE_THREAD] = -place;
@@ -413,7 +406,7 @@ PALPATE void tie_needle(const Fields& f, Thread t, int i, const Arc& arc, const 
   int ties = 0;
   for (int n = 0; n < count; ++n) {
     if (on_thread(s, n)) {
-      tie_thread(f, t, i, n, arc, weight, h, s);
+      tie_thread(f, t, i, n, arc, weight, s);
       continue;
     }
     ++ties;
@@ -494,18 +487,17 @@ PALPATE void aim_thread(const Fields& all, Thread t, int i) {
   for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
     const int at = all.tie_count.data[0];
     if (!on_thread(s, n) || at == MOST_TIES) continue;
-    double* tie = all.tie_value.data + 13 * at;
+    double* tie = all.tie_value.data + TIE_LENGTH * at;
     const Seat seat = seat_of_hole(f, s, n);
     const Passing by = passing(f, i, arc, hole(s, n)[HOLE_THREAD]);
     D3 vel = {0.0, 0.0, 0.0};
     for (int c = 0; c < seat.count; ++c) vel += seat.share[c] * goes_by(f.mj, f.own, seat.vert[c]);
     const D3 goes = in_world(f.own.frame.data, f.own.origin.data, seat.at + f.mj.timestep.data[0] * vel);
-    store(tie + 1, add_turned({0.0, 0.0, 0.0}, all.frame.data, goes - load(all.origin.data)));
-    tie[0] = by.part;
-    tie[4] = f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
-    tie[5] = thread_friction(f, i, by, seat, s, n);
-    tie[6] = dot(by.at - seat.at, by.along);
-    store(tie + 7, add_turned({0.0, 0.0, 0.0}, all.frame.data, turned(f.own.frame.data, by.along)));
+    store(tie + TIE_AIM, add_turned({0.0, 0.0, 0.0}, all.frame.data, goes - load(all.origin.data)));
+    tie[TIE_PART] = by.part;
+    tie[TIE_STIFFNESS] = f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
+    tie[TIE_FRICTION] = thread_friction(f, i, by, seat, s, n);
+    store(tie + TIE_ALONG, add_turned({0.0, 0.0, 0.0}, all.frame.data, turned(f.own.frame.data, by.along)));
     all.tie_edge.data[at] = by.edge;
     all.tie_count.data[0] = at + 1;
   }
@@ -522,7 +514,7 @@ PALPATE void feel_thread(const Fields& all, Thread t, int i) {
   for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
     if (!on_thread(s, n)) continue;
     const D3 zero = {0.0, 0.0, 0.0};
-    const D3 force = at < MOST_TIES ? turned(all.frame.data, load(all.tie_value.data + 13 * at++ + 10)) : zero;
+    const D3 force = at < MOST_TIES ? turned(all.frame.data, load(all.tie_value.data + TIE_LENGTH * at++ + TIE_FORCE)) : zero;
     store(f.pull.data + 3 * (POINTS * i + n), add_turned(zero, f.own.frame.data, zero - force));
   }
 }

@@ -141,7 +141,7 @@ PALPATE double step_cost(const Fields& f, const double* x, const double* turn, d
     sum += 0.5 * f.mass.data[i] / (h * h) * dot(off, off) + 0.5 * f.spin.data[i] / (h * h) * turn[i] * turn[i];
   });
   const double own = sum + rod_energy(f, x, turn) + contacts_energy(f, x, h, nullptr, nullptr, false) +
-                     ties_energy(f, x, h, nullptr, nullptr) + h * h * rows_cost(f, x, h, nullptr, nullptr);
+                     ties_energy(f, x, nullptr, nullptr) + h * h * rows_cost(f, x, h, nullptr, nullptr);
   return sum_together(own);
 }
 
@@ -159,7 +159,7 @@ PALPATE void assemble(const Fields& f, const double* x, const double* turn, doub
   });
   add_rod(f, x, turn, g, H, exact);
   contacts_energy(f, x, h, g, &H, exact);
-  ties_energy(f, x, h, g, &H);
+  ties_energy(f, x, g, &H);
 }
 
 // Takes unknowns out that do not change.
