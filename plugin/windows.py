@@ -25,7 +25,7 @@ _TOOL = (0.0025, 0.02)
 # Of a slot's body; it does not turn, and is lighter than any node.
 _INERTIA, _SHARE = 1e-8, 0.01
 _KEY_FIELDS = {"qpos": 0, "qvel": 1}  # columns of `_layout`
-_WINDOW_GROUP = 4  # drawn by nobody who does not ask for it
+_WINDOW_GROUP = 4  # not drawn by default
 
 
 def add_windows(

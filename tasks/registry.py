@@ -84,7 +84,7 @@ def exercise(name: str, time_limit: float, *tags: str) -> Callable:
     ENTRIES[name] = Entry(name, float(time_limit), tags, make, summary)
     domain, task = parts.groups()
     TASKS[domain] = tuple(dict.fromkeys((*TASKS.get(domain, ()), task)))
-    for other in sorted(TASKS):  # in the order of the domains, whoever imports whom
+    for other in sorted(TASKS):  # in the order of the domains, not of imports
       TASKS[other] = TASKS.pop(other)
     _register(domain, task)
     return make

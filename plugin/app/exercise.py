@@ -119,7 +119,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _check_who(args: argparse.Namespace):
-  """Raises CommandError where the options do not agree on who does what."""
+  """Raises CommandError where the options contradict each other."""
   if args.device and not args.task:
     raise CommandError("device is given without a TASK; a replay takes no device")
   if args.left and not args.device:

@@ -96,7 +96,7 @@ class Organ(Tissue):
     model, d, m = batch.model, batch.d, batch.m
     node = self.body.shape.node.numpy()
     mass = np.ones(self.body.shape.nnode, np.float32)
-    mass[node] = np.where(organ.mass > 0, organ.mass, 1.0)  # what waits for a cut has none
+    mass[node] = np.where(organ.mass > 0, organ.mass, 1.0)  # spare vertices have none
     self.body.state.mass.assign(np.tile(order.to_slices(mass), (nworld, 1, 1)))
     nodal, surface = w.inertia(model._address), patch.Surface(self.body, organ, model, tools, lines)
     if not organ.windows:

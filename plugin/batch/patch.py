@@ -206,7 +206,7 @@ class Surface:
       self._held = proxies.hold(organ, mass)
     else:
       wall, own = proxies.WALL * organ.mass[organ.free].sum(), mass[organ.jointed]
-      some = own[own > 0].mean()  # as `prepare` gives it to what waits for a cut
+      some = own[own > 0].mean()  # as `prepare` gives it to spare vertices
       self._held = np.where(organ.free, np.where(mass > 0, mass, some), wall)
 
   def make(self, mesh) -> dict[str, np.ndarray]:

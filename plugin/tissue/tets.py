@@ -46,7 +46,7 @@ class Within:
   nwait: int  # the last so many wait for edges that cuts divide
   nchanged: int
   every: int  # whether all is written, but what a surface has too
-  clears: int  # whether blocks of neighbours that are none any more are in `half`
+  clears: int  # whether blocks of former neighbours are in `half`
   nint: int  # whole numbers of scratch
   nreal: int  # others
   skip: wp.int64  # words by which what is written to lies after the arrays
@@ -220,7 +220,7 @@ class Tets:
     self._set(**{name: arrays[name] for name in (*NAMES, *ADDRESSES) if name in arrays})
 
   def clear(self, half: wp.array):
-    """Clears the blocks of neighbours that are none any more, on the CPU."""
+    """Clears the blocks of former neighbours, on the CPU."""
     self._set(half=half.flatten(), clears=1)
 
   def _set(self, **values):

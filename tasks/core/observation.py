@@ -28,7 +28,7 @@ from .physics import COARSE, NEAR, Physics
 from .scenes import CAMERA
 
 GROUPS = ("sensors", "state")
-TRUTH = "truth"  # group of what pictures are labelled with, which only who asks for it has
+TRUTH = "truth"  # group of the labels of pictures, only on request
 SIZE = (84, 84)  # of pictures, height and width [pixels]
 BASE = 0.005  # between the lenses of a stereo laparoscope [m]
 LABELS = {"organ": 1, "instrument": 2, "target": 3}  # of `segmentation`, 0 is anything else

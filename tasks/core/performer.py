@@ -393,7 +393,7 @@ class Performer:
   def feel(self, point: np.ndarray, along: np.ndarray, depth: float) -> Feeling:
     """Presses to a depth [m] below a point in one stroke; returns the stiffness felt [N/m]."""
     yield from self.line(point + depth * self.excess(0.0) * along, speed=0.03)
-    yield from Performer.wait(self, self.style.reaction + 0.1)  # whoever learns from it
+    yield from Performer.wait(self, self.style.reaction + 0.1)  # subclasses too
     force = float(np.linalg.norm(self.hand.contact_force()))
     return force / max(float((self.hand.tip_pos() - point) @ along), 1e-3)
 
@@ -407,7 +407,7 @@ class Performer:
     """
     physics, up = self.physics, self.hand.trocar().mat[:, 2]
     self.firm = self._enough = grip + _FIRMER * min(again, 2)
-    if self.task.grasped:  # by who had the instrument before
+    if self.task.grasped:  # by the performer that had the instrument before
       self.extra[:] = self._share()
       return
     self.roll, deep = _ROLL, min(0.009 + 0.0015 * again, 0.012)

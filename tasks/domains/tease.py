@@ -50,7 +50,7 @@ SCENE = Scene(
 # [m/s]. Back faster, the tip leaves what it held up, and the strip falls on the shaft behind it.
 _OVER, _BEHIND, _BEYOND, _LANE = 0.002, 0.006, 0.006, 0.006
 _SPEED, _BACK = 0.03, 0.012
-_UNDER, _LOW = 0.02, 0.005  # from the front and the bed at most, of who is under the strip [m]
+_UNDER, _LOW = 0.02, 0.005  # from the front and the bed at most, of a tip under the strip [m]
 ROW = 0.5 * _LANE  # bonds of the front are no farther from the first of them [m]
 
 

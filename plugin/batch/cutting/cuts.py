@@ -277,7 +277,7 @@ class Cuts(passive.Opening):
     for _ in range(2 * body.has_bending):  # what is left of the first time is exact
       self._meshes.angle(worlds, step.rest_angles(body))
     if body.is_solid:
-      for world in worlds:  # whose blocks have neighbours that are none any more
+      for world in worlds:  # whose blocks have former neighbours
         body.system.half[world].zero_()
     mass = np.ones((len(worlds), body.shape.nnode), np.float32)
     scale = organ.patch.mass_scale.numpy()

@@ -3,7 +3,7 @@
 //
 // On the CPU a world has one thread. On CUDA it has `nthread` in whole blocks, all resident. What
 // they tell each other goes through memory in words of 128 bits, three numbers and the number of
-// the turn, which are written and read whole: whoever waits for a word needs neither counter nor
+// the turn, which are written and read whole: a thread that waits for a word needs neither counter nor
 // fence. Turns go on from launch to launch; the last one is kept behind the words. In a meeting
 // each block publishes its sums and reads those of all, in two sets that alternate: who meets again
 // has read the set before. The order of summation is fixed, so that runs repeat to the bit.

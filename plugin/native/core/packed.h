@@ -1,4 +1,4 @@
-// Numbers and vectors as they lie best for who reads them often: of 16 bits, side by side, two in one.
+// Numbers and vectors packed for code that reads them often: of 16 bits, side by side, two in one.
 #pragma once
 #include "core/simd.h"
 

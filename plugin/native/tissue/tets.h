@@ -94,7 +94,7 @@ PALPATE void put_means(const F& f, const S& m, int v, int origin, D3* sum) {
   }
 }
 
-// No block of a node is left of neighbours that are none any more.
+// No block of a node is left of former neighbours.
 template <class F>
 PALPATE void clear_blocks(const F& f, int v) {
   const int own = f.node.data[v], s = own / LANES, lane = own % LANES;

@@ -110,7 +110,7 @@ class Edges:
       arrays: of `Shape` and `Tissue`, on the CPU
       node: of each vertex
       nnode: number of nodes
-      half: of a solid, blocks to clear of neighbours that are none any more, or None
+      half: of a solid, blocks to clear of former neighbours, or None
     """
     if self._rows is None:
       self._rows = rows.Rows(self._copy, arrays, node)

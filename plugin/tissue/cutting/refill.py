@@ -58,7 +58,7 @@ class Refill:
     if body.device.is_cuda:
       for name in self._names:
         self._arrays[name].assign(self._here[name])
-      body.system.half.zero_()  # of neighbours that are none any more
+      body.system.half.zero_()  # of former neighbours
     self.mesh = mesh
     if body.is_solid:
       return

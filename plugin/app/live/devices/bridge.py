@@ -111,7 +111,7 @@ class Bridge(Silent):
     )
 
   def send(self, force: Three, torque: Three) -> None:
-    """Sends a force to whoever sends the poses."""
+    """Sends a force to the sender of the poses."""
     if self._peer is None:
       return
     packet = FORCE.pack(b"PALF", _VERSION, self._number, *force, *torque)
