@@ -174,7 +174,7 @@ def test_a_spinning_organ_keeps_its_angular_momentum(make, h):
   organ.set_state(organ.xpos, np.cross([1.0, 2.0, 6.0], organ.xpos))
   batch.set_state(1, data)
   before, tissue = (mass * np.cross(organ.xpos, organ.xvel)).sum(axis=0), batch.organ("organ")
-  batch.step(round(1 / h))
+  batch.step(round(0.3 / h))  # Euler's step alone loses 1 % of it in that time at 1 ms
   after = (mass * np.cross(tissue.xpos.numpy()[1], tissue.xvel.numpy()[1])).sum(axis=0)
   np.testing.assert_allclose(after, before, atol=2e-3 * np.linalg.norm(before))
 
@@ -193,7 +193,7 @@ def test_a_block_comes_to_rest_under_a_plate(make):
   assert np.all(last.std(axis=0) < 0.006 * last.mean(axis=0))
 
 
-@pytest.mark.parametrize("h", [1e-3, 2e-3])
+@pytest.mark.parametrize("h", [pytest.param(1e-3, marks=pytest.mark.slow), 2e-3])
 def test_a_plate_over_more_nodes_than_slots_comes_to_rest_and_is_told(make, h):
   if make.device == "cpu":
     pytest.skip("its windows have room")

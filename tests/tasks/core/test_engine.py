@@ -38,12 +38,11 @@ np.savez(sys.argv[3], **pictures, **rewards, **extra)
 
 
 @pytest.mark.skipif(find_spec("dm_control") is None, reason="dm_control is not installed")
-@pytest.mark.parametrize("task", ["touch/easy", "grasp/easy"])
-def test_an_exercise_without_dm_control_does_the_same(task, tmp_path):
+def test_an_exercise_without_dm_control_does_the_same(tmp_path):
   found = []
   for how in ("with", "without"):
     path = tmp_path / f"{how}.npz"
-    subprocess.run([sys.executable, "-c", SCRIPT, how, task, str(path)], check=True, timeout=300)
+    subprocess.run([sys.executable, "-c", SCRIPT, how, "grasp/easy", str(path)], check=True, timeout=300)
     found.append(np.load(path))
   one, two = found
   assert set(one) == set(two)

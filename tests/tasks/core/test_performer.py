@@ -15,12 +15,11 @@ OTHERS = ["/".join(pair) for pair in tasks.ALL_TASKS if pair not in tasks.EASY]
 # Least norms that an expert's observations never reach [N, -]; a hook divides without touching.
 BELOW = {"shaft_force": 0.05, "hook_shaft_force": 0.05, "burnt": 0.1}
 UNTOUCHED = {"hook_contact_force", "hook_peak_force"}
-# Searches, strokes and lines of 15 s and more: of the easy ones one seed, the others are slow.
-LONG = {"probe/palpate_easy", "probe/palpate_standard", "probe/palpate_hard"}
+# Searches, strokes, lines and rings of 15 s and more, which are slow, but for the easy ones.
+LONG = {"probe/palpate_standard", "probe/palpate_hard"}
+LONG |= {"needle/transfer_standard", "needle/transfer_hard"}  # the first in tests/tasks
 LONG |= {
-  f"{domain}/{task}"
-  for domain in ("bimanual", "cut", "tease")
-  for task in ("easy", "standard", "hard")
+  f"{domain}/{task}" for domain in ("bimanual", "cut", "tease") for task in ("standard", "hard")
 }
 
 # Who holds the laparoscope meets nothing, and marks without a pin have no side. An expert's needle
@@ -57,8 +56,7 @@ def wins(name, seeds):
 
 @pytest.mark.parametrize("name", EASY)
 def test_expert_solves_the_easy_tasks(name):
-  seeds = range(1 if name in LONG else 2)
-  assert wins(name, seeds) == len(seeds)
+  assert wins(name, range(1)) == 1
 
 
 @pytest.mark.parametrize("name", [name for name in OTHERS if name not in LONG])
