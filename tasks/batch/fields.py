@@ -6,6 +6,7 @@ axes of the instrument.
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
+from palpate.batch.needles import HOLES
 from palpate.tasks.core.physics import COARSE, NEAR
 from palpate.tasks.core.rules import OUTCOMES
 from palpate.tissue.types import Array, doubles, floats, ints, struct
@@ -75,6 +76,11 @@ class Common:
   cutter_length: floats("nworld", "ncutter")  # [m]
   cutter_seat: floats("nworld", "ncutter", 3)  # [m]
   piece_count: ints("nworld")
+  # Of needles that go through it, see `palpate.batch.needles.Needles`.
+  needle_force: floats("nworld", "nneedle", 3)  # [N]
+  hole_count: ints("nworld", "nneedle")
+  hole_rest: floats("nworld", "nneedle", HOLES, 3)  # [m]
+  hole_along: floats("nworld", "nneedle", HOLES)  # [m]
   # Of the other hand.
   other_tip_pos: floats("nworld", 3)
   other_tip_quat: floats("nworld", 4)

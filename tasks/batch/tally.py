@@ -36,6 +36,7 @@ class Tally:
 
   contact: float  # force above which there is contact [N]
   limit: float  # of force and grip [N]
+  grips: int  # whether the grip has one
   h: wp.float64  # step of the physics [s]
   values: floats("nworld", len(NAMES))
   pos: floats("nworld", 3)  # of the tip, a control step ago [m]
@@ -244,6 +245,8 @@ def _tell(s: Common, t: Tally, w: int):
   t.values[w, M.peak_shaft_force] = float(t.shaft_peak[w])
   t.values[w, M.peak_surroundings_force] = wp.where(s.around >= 0, float(t.around_peak[w]), wp.nan)
   _tell_force(t, w, _GRIP, M.peak_grip, M.mean_grip, M.grip_breaches)
+  if t.grips == 0:
+    t.values[w, M.grip_breaches] = wp.nan
   end = wp.min(_end(t, w, _TIP), _end(t, w, _GRIP))
   gripped = t.gripped[w] - end * t.last[w, _GRIP]
   t.values[w, M.grip_ratio] = _share(gripped, t.pulled[w] - end * last)

@@ -131,6 +131,22 @@ def scraped(s: Common):
 
 
 @word
+def pierced(s: Common):
+  """See `rules`."""
+  w = s.world
+  pull = wp.vec3(s.needle_force[w, 0, 0], s.needle_force[w, 0, 1], s.needle_force[w, 0, 2])
+  return s.hole_count[w, 0], wp.length(pull)
+
+
+@word
+def pinhole(s: Common, k: int):
+  """See `rules`."""
+  w = s.world
+  rest = wp.vec3(s.hole_rest[w, 0, k, 0], s.hole_rest[w, 0, k, 1], s.hole_rest[w, 0, k, 2])
+  return rest, s.hole_along[w, 0, k]
+
+
+@word
 def lens(s: Common):
   """See `rules`."""
   return tip(s)

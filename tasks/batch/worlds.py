@@ -127,7 +127,7 @@ class Worlds:
       nv=model.nv, nu=model.nu, nsensordata=model.nsensordata, nstep=self._substeps,
       naction=len(task.components), naxis=len(names), ncontrol=len(names) + 1,
       nside=model.ngeom + 1, nspot=len(getattr(task, "disc", ())), nbond=len(physics.organ.bonds),
-      ncutter=len(physics.organ.cutters),
+      ncutter=len(physics.organ.cutters), nneedle=len(physics.organ.needles),
     )  # fmt: skip
     s = allocate(Common, self.device, sizes)
     s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
@@ -160,7 +160,10 @@ class Worlds:
   def _count(self, task: Any) -> Any:
     """Returns the sums that metrics are made of."""
     t = allocate(tally.Tally, self.device, {"nworld": self.nworld})
-    t.contact, t.limit = task.settings().contact_force, task.force_limit
+    limits = task.settings()
+    t.contact, t.limit, t.grips = (
+      limits.contact_force, task.force_limit, int(limits.grip_limit is not None)
+    )  # fmt: skip
     t.h = self.batch.model.opt.timestep
     return t
 
@@ -202,6 +205,10 @@ class Worlds:
       found = organ.cutters
       s.cutter_inside, s.cutter_length, s.cutter_seat = found.inside, found.length, found.seat
       s.piece_count = organ.piece_count
+    if s.needle_force.shape[1]:
+      found = organ.needles
+      s.needle_force, s.hole_count = found.force, found.count
+      s.hole_rest, s.hole_along = found.hole_rest, found.hole_along
 
   # Doing.
 

@@ -267,6 +267,18 @@ def scraped(s: Any) -> float:
   return length(s.felt_by("scrape"))
 
 
+def pierced(s: Any) -> tuple[int, float]:
+  """Returns how many holes the needle has in the organ, and its pull on that [N]."""
+  (found,) = s.organ.needles
+  return len(found.holes), length(found.force)
+
+
+def pinhole(s: Any, k: int) -> tuple[np.ndarray, float]:
+  """Returns where one of these is at rest, and how far along the needle from its swage [m, m]."""
+  hole = s.organ.needles[0].holes[k]
+  return hole.rest, float(hole.along)
+
+
 def lens(s: Any) -> np.ndarray:
   """Returns where the lens of the laparoscope is that one holds [m]."""
   return s.lens()[0]

@@ -19,15 +19,37 @@ for half a second, a force of the needle on the wall above the damage limit, or 
 import dataclasses
 import functools
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
 import palpate
+import warp as wp
+from palpate.tissue.types import Array, floats
 
 from ..core.base import Physics
 from ..core.performer import Performer, Script
-from ..core.rules import closeness
+from ..core.rules import (
+  DAMAGED,
+  FAR,
+  HIDDEN,
+  LATER,
+  MISSED,
+  NOW,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  clamp,
+  closeness,
+  length,
+  needle_place,
+  pierced,
+  pinhole,
+  reach,
+  root,
+  vector,
+)
 from ..core.scenes import Scene
 from ..registry import exercise
 from . import sheet
@@ -35,7 +57,9 @@ from .needles import (
   LOST,
   MEETS,
   PIECES,
+  QUARTER,
   RADIUS,
+  Hands,
   Needlework,
   Pose,
   arc,
@@ -48,6 +72,7 @@ from .needles import (
 
 BITE = 0.012  # between the marks [m]; FLS: 5 mm on either side of a slit
 WANTED = 0.005  # how far the tip is to come out [m]
+MARK = 0.0008  # radius of a mark, and how far above the wall it is [m]
 # Energy that it takes to open an area of the wall [J/m^2], and friction in it [N/m]; skin takes
 # 2500, liver 75 to 185 (10.1007/978-3-540-70521-5_18).
 TOUGH, FRICTION = 800.0, 15.0
@@ -81,9 +106,106 @@ def hard(**kwargs):
   return Drive(FIELD, **kwargs)
 
 
+class State(Hands):
+  """State of a world."""
+
+  tolerance: float  # how far holes may be from their marks [m]
+  damage: float  # [N]
+  marks: Annotated[Any, Array(wp.vec3, ("targets",))]  # [m]
+  misses: Annotated[Any, floats("targets")]  # how far the holes are from them [m]
+  start0: float  # how far the tip was from the first one at the start [m]
+  holes: int
+  pull: float  # of the needle on the wall [N]
+  pulled: float  # the largest so far [N]
+  deepest: float  # how far the needle was under the wall [m]
+  target: Vector
+  way: Vector
+  circle: Vector
+  middle: Vector
+  pierced: float
+  out: float
+  holds: float
+
+
+# The rules.
+
+
+def open_holes(s, o, count):
+  """Compares holes that are new with their marks; returns how far one is off at most [m]."""
+  for k in range(o.holes, count):
+    place, _ = pinhole(s, k)
+    off = place - o.marks[k]
+    o.misses[k] = root(off[0] * off[0] + off[1] * off[1])
+    reach(s, o, o.misses[k])
+  o.holes = count
+  worst = float(0.0)  # noqa: UP018 - a variable to Warp
+  for k in range(count):
+    worst = max(worst, o.misses[k])
+  return o, worst
+
+
+def lowest(s):
+  """Returns the height of the needle's lowest piece over the wall [m]."""
+  least = float(FAR)
+  for k in range(PIECES + 1):
+    least = min(least, float(arc(s, float(k) / float(PIECES))[2]))
+  return least
+
+
+def advance(s, o):
+  """Follows the needle through the wall."""
+  o = grasped(s, o, right_grasp(s), 0.0)
+  count, pull = pierced(s)
+  o.pull = pull
+  o.pulled = max(o.pulled, pull)
+  o, worst = open_holes(s, o, min(count, 2))
+  if o.holes > 0:
+    o.deepest = max(o.deepest, -lowest(s))
+  o.out = 0.0
+  if o.holes == 2:
+    _, along = pinhole(s, 1)
+    o.out = clamp((2.0 * QUARTER * RADIUS - along) / WANTED, 0.0, 1.0)
+  if o.pull > o.damage:
+    return o, -1.0, DAMAGED
+  far = length(arc(s, 1.0) - o.marks[min(o.holes, 1)])
+  progress = 0.3 * closeness(far, o.start0)
+  if o.holes == 1:
+    progress = 0.4 + 0.2 * closeness(far, BITE)
+  if o.holes == 2:
+    progress = 0.7 + 0.3 * o.out
+  if worst > o.tolerance or o.loose > LOST:
+    return o, progress, MISSED
+  return o, progress, SUCCESS if o.out >= 1.0 else RUNNING
+
+
+def observe(s, o):
+  """Finds where the needle is."""
+  middle = needle_place(s, vector(0.0, 0.0, 0.0))
+  o.target = o.marks[min(o.holes, 1)] - arc(s, 1.0)
+  o.circle = needle_place(s, vector(0.0, 0.0, 1.0)) - middle
+  o.middle = middle - o.marks[0]
+  o.pierced = float(o.holes)
+  o.holds = o.right_holds
+  return o
+
+
+def mark(s, o, k):
+  """Marks what is left, the next one in yellow."""
+  look = LATER if k > o.holes else HIDDEN
+  return o.marks[k] + vector(0.0, 0.0, MARK), NOW if k == o.holes else look
+
+
 class Drive(Needlework):
   """Drive a needle through two marks."""
 
+  rules = Rules(
+    State,
+    advance,
+    observe,
+    ("target", "way", "circle", "middle", "pierced", "out", "holds"),
+    metrics={"peak_traction": "pulled", "bite_depth": "deepest"},
+    mark=mark,
+  )
   targets = 2
 
   def __init__(
@@ -133,8 +255,9 @@ class Drive(Needlework):
     place, mat = posed(self, -self.half - math.radians(20.0))
     place = place + np.array([0.0, 0.0, _OVER]) + self.random.uniform(-0.003, 0.003, 3)
     tip = self.take_up(physics, (place, mat), _HELD_AT, lean=0.15, along=0.1)
-    self.holes, self.misses = 0, [0.0, 0.0]
-    self.out = self.deepest = self.pull = 0.0
+    self.holes, self.misses = 0, np.zeros(2)
+    self.out = self.deepest = self.pull = self.pulled = self.pierced = 0.0
+    self.holds, self.target, self.circle, self.middle = 1.0, *np.zeros((3, 3))
     self.start0 = float(np.linalg.norm(tip - self.marks[0]))
 
   @property
@@ -142,57 +265,15 @@ class Drive(Needlework):
     """Half of the angle that the bite has on the needle's circle [rad]."""
     return math.asin(0.5 * BITE / RADIUS)
 
-  def advance(self, physics: Physics) -> float:
-    """Follows the needle through the wall."""
-    grasped(physics, self, right_grasp(physics), 0.0)
-    (found,) = physics.organ.needles
-    self.pull = float(np.linalg.norm(found.force))
-    for k, hole in enumerate(found.holes[:2]):
-      if k == self.holes:
-        self.misses[k] = float(np.linalg.norm((hole.rest - self.marks[k])[:2]))
-        self.event(physics, "target", self.misses[k], "hole")
-    self.holes = min(len(found.holes), 2)
-    tip = arc(physics, 1.0)
-    if self.holes:
-      low = min(float(arc(physics, k / PIECES)[2]) for k in range(PIECES + 1))
-      self.deepest = max(self.deepest, -low)
-    self.out = 0.0
-    if self.holes == 2:
-      self.out = min(max((RADIUS * math.pi - found.holes[1].along) / WANTED, 0.0), 1.0)
-    self.show(physics)
-    if any(error > self.tolerance for error in self.misses[: self.holes]) or self.loose > LOST:
-      self.outcome = "missed"
-    if self.pull > self.damage:
-      self.outcome = "damage"
-      self.event(physics, "note", label=f"torn by a pull of {self.pull:.2f} N")
-      return -1.0
-    far = float(np.linalg.norm(tip - self.marks[min(self.holes, 1)]))
-    if self.holes == 0:
-      return 0.3 * closeness(far, self.start0)
-    if self.holes == 1:
-      return 0.4 + 0.2 * closeness(far, BITE)
-    if self.out >= 1.0 and self.outcome is None:
-      self.outcome = "success"
-      return 1.0
-    return 0.7 + 0.3 * self.out
+  def mark_size(self, k: int) -> float:
+    """Returns the radius of a mark [m]."""
+    return MARK
 
-  def show(self, physics: Physics) -> None:
-    """Draws the marks that are left, the next one in yellow."""
-    for k, mark in enumerate(self.marks):
-      physics.mark(k, mark + np.array([0.0, 0.0, 0.0008]), k >= self.holes, k == self.holes, 0.0008)
-
-  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Finds where the needle is."""
-    pos, mat = needle(physics)
-    return {
-      "target": self.marks[min(self.holes, 1)] - arc(physics, 1.0),
-      "way": self.way.copy(),
-      "circle": mat[:, 2],
-      "middle": pos - self.marks[0],
-      "pierced": np.array([float(self.holes)]),
-      "out": np.array([self.out]),
-      "holds": np.array([self.right_holds]),
-    }
+  def label(self, kind: str) -> str:
+    """Returns what an event of the rules is called."""
+    if kind == "damage":
+      return f"torn by a pull of {self.pull:.2f} N"
+    return "hole" if kind == "target" else super().label(kind)
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns the needle's pull on the wall, and how deep it went."""

@@ -50,9 +50,3 @@ def test_who_lets_go_has_missed():
   while not timestep.last():
     timestep = env.step(action)
   assert env.task.outcome == "missed" and env.task.holes == 0
-
-
-def test_many_worlds_are_refused_by_name():
-  gymnasium = pytest.importorskip("gymnasium")
-  with pytest.raises(ValueError, match="suture/drive_easy: rules of Drive is None"):
-    gymnasium.make_vec("palpate/SutureDriveEasy-v0", num_envs=2, device="cpu")
