@@ -42,7 +42,8 @@ def test_an_exercise_without_dm_control_does_the_same(tmp_path):
   found = []
   for how in ("with", "without"):
     path = tmp_path / f"{how}.npz"
-    subprocess.run([sys.executable, "-c", SCRIPT, how, "grasp/easy", str(path)], check=True, timeout=300)
+    command = [sys.executable, "-c", SCRIPT, how, "grasp/easy", str(path)]
+    subprocess.run(command, check=True, timeout=300)
     found.append(np.load(path))
   one, two = found
   assert set(one) == set(two)

@@ -23,11 +23,11 @@ LONG |= {
 }
 
 # Who holds the laparoscope meets nothing, and marks without a pin have no side. An expert's needle
-# drivers enter beside what they meet, a ring has one way, and who drives a needle does not let go.
+# drivers enter beside what they meet, a ring or a bite has one way, and a needle that is driven is held.
 CONSTANT = {
   "navigate": {"contact_force", "peak_force", "surface", "side"},
   "needle": {"left_psm_shaft_force", "way"},
-  "suture": {"holds"},
+  "suture": {"holds", "way"},
 }
 
 
