@@ -408,17 +408,17 @@ class Performer:
     physics, up = self.physics, self.hand.trocar().mat[:, 2]
     self.firm = self._enough = grip + _FIRMER * min(again, 2)
     if self.task.grasped:  # by the performer that had the instrument before
-      self.extra[:] = self._share()
+      self.extra[:] = self.share()
       return
     self.roll, deep = _ROLL, min(0.009 + 0.0015 * again, 0.012)
     below = np.linalg.norm(physics.point(site) - deep * up - self.hand.tip_pos())
-    if again or below > _THERE or self._share() > _WIDE - 0.1:
+    if again or below > _THERE or self.share() > _WIDE - 0.1:
       self.extra[:] = _WIDE
       yield from self.above(physics.point(site) - deep * up, 0.012 + deep, up)
       yield from self.wait(0.2)
       yield from self.move(physics.point(site) - deep * up, speed=0.03)
     else:  # somebody else was about to close
-      self.extra[:] = self._share()
+      self.extra[:] = self.share()
     while self.extra[0] > -0.35:
       self.extra[0] -= 3.0 * self.dt
       yield self.step()
@@ -432,7 +432,7 @@ class Performer:
     self.extra[:] = 1.0
     yield self.step()
 
-  def _share(self) -> float:
+  def share(self) -> float:
     """Returns the action of the jaw that is their target now."""
     low, high = self.physics.model.ptr.actuator_ctrlrange[self.hand.jaw]
     return float(2 * (self.hand.gripper()[1] - low) / (high - low) - 1)

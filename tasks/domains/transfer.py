@@ -21,6 +21,7 @@ damage limit, or the time limit.
 import dataclasses
 import itertools
 import math
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import mujoco
@@ -63,7 +64,9 @@ from .needles import (
   Needlework,
   Pose,
   about,
+  apart,
   arc,
+  away,
   carry,
   grasp,
   grasped,
@@ -90,6 +93,9 @@ _APART = 0.034  # of rings: needle and wrist have room between them [m]
 # turn that an end enters with, that of the handing over, and what is behind the ring in the end.
 _ENTERS, _HANDS, _TAKES = math.radians(20.0), math.radians(20.0), math.radians(65.0)
 _BACK, _RISE = 0.014, 0.016  # out of a ring, and off the needle [m]
+# Of a teacher: width of the cone over a goal, at its tip [m] and by height [-], how far a frame may
+# be turned there [rad], height that jaws close from, and how far off a hand has let go [m].
+_NARROW, _CONE, _TURNED, _CLOSES, _CLEAR = 0.0015, 0.2, 0.2, 0.002, 0.02
 
 
 @exercise("needle/transfer_easy", 25, "easy", "bimanual")
@@ -325,9 +331,10 @@ class Transfer(Needlework):
       gives, takes = (p.other, p) if back(self) else (p, p.other)
       mine, others = self.right_holds > 0, self.left_holds > 0
       giver, taker = (others, mine) if back(self) else (mine, others)
-      if giver and taker and self.through:
+      off = self.through - (0.5 - _HANDS / math.pi)
+      if taker and self.through and (giver or _lingers(gives)):
         yield from one(p, gives, _let_go(self, gives))
-      elif giver and self.through < 0.47 - _HANDS / math.pi:
+      elif giver and (off < -0.03 or (p.hasty and abs(off) > 0.02)):
         yield from one(p, gives, self._drive(gives))
       elif giver:
         yield from one(p, takes, self._take(takes))
@@ -348,8 +355,11 @@ class Transfer(Needlework):
         if left > 0 and np.linalg.norm(off) < _APART / 2:
           out = pos - sign * left * self.ways[ring - 1]
           yield from carry(p, lambda t: (out, turned))
-      clear = place - sign * _BACK * self.ways[ring]
-      yield from carry(p, lambda t: (clear, mat))
+      way = sign * self.ways[ring]
+      clear = place - _BACK * way
+      yield from _come(
+        carry(p, lambda t: (clear, mat)), lambda: _over(p, needle(p.physics), (place, mat), -way)
+      )
       yield from carry(p, lambda t: (place, mat))
     start, end = turn_of(self, p.physics), -QUARTER - sign * _HANDS
     yield from carry(p, lambda t: posed(self, ring, start + t * (end - start)), end - start)
@@ -359,8 +369,12 @@ class Transfer(Needlework):
     sign = -1.0 if back(self) else 1.0
     pos, mat = needle(p.physics)
     goal, turn = grasp(p.trocar, pos, mat, sign * _TAKES, p.turn)
-    p.extra[:] = WIDE
-    yield from move_tip(p, goal + _RISE * mat[:, 2], turn)
+    up = mat[:, 2]
+    closes = _over(p, (p.tip, p.turn), (goal, turn), up) and (p.tip - goal) @ up < _CLOSES
+    p.extra[:] = p.share() if closes else WIDE
+    yield from _come(
+      move_tip(p, goal + _RISE * up, turn), lambda: _over(p, (p.tip, p.turn), (goal, turn), up)
+    )
     yield from move_tip(p, goal, turn)
     yield from jaws(p, -1.0)
     yield from p.wait(0.2)
@@ -407,6 +421,33 @@ def park(task: Transfer, port: Any, middle: np.ndarray) -> Pose:
 def _let_go(task: Transfer, p: Performer) -> Script:
   """Opens the jaws and takes the hand aside."""
   yield from jaws(p, WIDE)
-  yield from move_tip(p, p.tip + _RISE * p.turn[:, 2], p.turn)
+
+  def gone() -> bool:
+    return p.hasty and not _lingers(p)
+
+  yield from _come(move_tip(p, p.tip + _RISE * p.turn[:, 2], p.turn), gone)
   pos, turn = park(task, p.trocar, task.middles.mean(axis=0))
-  yield from move_tip(p, pos, turn)
+  yield from _come(move_tip(p, pos, turn), gone)
+
+
+# What a teacher leaves out: two who come to one place by different ways go on alike from there.
+
+
+def _come(script: Script, there: Callable[[], bool]) -> Script:
+  """Does a script until something is so."""
+  while not there() and (action := next(script, None)) is not None:
+    yield action
+
+
+def _over(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> bool:
+  """Returns whether a teacher's pose is in the cone over a goal that it comes down in."""
+  off = pose[0] - goal[0]
+  high = float(off @ up)
+  aside = float(np.linalg.norm(off - high * up))
+  far = aside > _NARROW + _CONE * max(high, 0.0) or apart(pose[1], goal[1]) > _TURNED
+  return p.hasty and -2 * _NARROW < high < 2 * _RISE and not far
+
+
+def _lingers(p: Performer) -> bool:
+  """Returns whether a teacher's hand that let go is still at the needle."""
+  return p.hasty and away(p.physics, p.hand.tip_pos()) < _CLEAR

@@ -51,6 +51,25 @@ def test_an_expert_presses_on_the_site_where_another_came_down_beside_it():
       assert probe.distance(env.physics, env.task) < 0.00025  # a limit of proficiency
 
 
+def test_a_teacher_of_the_transfer_goes_on_where_another_has_come_to():
+  kwargs = {"random": 3, "surroundings": "none"}
+  env = tasks.load("needle", "transfer_easy", task_kwargs=kwargs)
+
+  def before_the_ring(task):
+    ahead = float(task.lead @ task.way)
+    return -0.008 < ahead < -0.005 and np.linalg.norm(task.lead - ahead * task.way) < 0.001
+
+  timestep = played(env, lessons.Teacher(env), before_the_ring)
+  for _ in range(2):  # towards the ring, then down to the needle
+    act, far = lessons.Teacher(env), []
+    for _ in range(8):
+      timestep = env.step(act(timestep))
+      far.append(np.linalg.norm(env.task.target if env.task.through else env.task.lead))
+    assert (np.diff(far) < 0).all()
+    while not env.task.through or np.linalg.norm(env.task.target) > 0.007:
+      timestep = env.step(act(timestep))
+
+
 def test_a_lesson_is_what_the_expert_meant_from_its_turn_on():
   env = tasks.load("touch", "easy", task_kwargs={"surroundings": "none"})
   names = ("target", "joints")
