@@ -22,8 +22,8 @@ LONG |= {
   f"{domain}/{task}" for domain in ("bimanual", "cut", "tease") for task in ("standard", "hard")
 }
 
-# Who holds the laparoscope meets nothing, and marks without a pin have no side. An expert's needle
-# drivers enter beside what they meet, a ring or a bite has one way, and a needle that is driven is held.
+# A laparoscope meets nothing, and marks without a pin have no side. An expert's needle drivers
+# enter beside what they meet, a ring or a bite has one way, and a needle that is driven is held.
 CONSTANT = {
   "navigate": {"contact_force", "peak_force", "surface", "side"},
   "needle": {"left_psm_shaft_force", "way"},
