@@ -187,7 +187,7 @@ class Tets:
   """
 
   def __init__(self, mesh: Mesh, lay: Layout, node: np.ndarray, arrays: Mapping[str, Any]):
-    whole = self._whole = mesh.whole
+    whole = mesh.whole
     self._order = lay.order
     self._place = np.argsort(lay.order)
     ntet, nvert, npair = len(whole.tet), whole.nvert, len(lay.which)

@@ -7,7 +7,6 @@ from palpate.tasks.metrics import knots
 from palpate.tissue.sutures import DIAMETER, SUTURES
 
 RADIUS, YOUNG, DENSITY = 1.125e-4, 8.7e9, 1330.0  # silk 3-0
-BEND = 0.02
 
 
 def resampled(curve, segment):
