@@ -285,7 +285,7 @@ def test_ctrl_c_keeps_the_best_so_far(tmp_path, record):
     [sys.executable, "-c", code, "fit", data, *slow, "--out", str(out)],
     stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ,
   ) as process:  # fmt: skip
-    time.sleep(8)
+    time.sleep(5)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=120)
   assert process.returncode == 130, said
