@@ -133,7 +133,7 @@ class Bonds:
 
   @property
   def stored(self) -> float:
-    """Elastic energy that they had then, less what the step's damage took of it [J]."""
+    """Elastic energy as the last step began, less what the step's damage took of it [J]."""
     stiffness = np.repeat(
       [g.law.stiffness for g in self._groups], [len(g.now["vert"]) for g in self._groups]
     )

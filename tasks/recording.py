@@ -430,7 +430,7 @@ def _check_meta(meta: Any) -> dict[str, Any]:
 
 
 def check_substeps(substeps: Any) -> int:
-  """Returns the number; ValueError unless it is a whole one above 0."""
+  """Returns the number of substeps; ValueError unless it is a whole number above 0."""
   if type(substeps) is not int or substeps < 1:
     raise ValueError(f"substeps is {substeps!r}, expected a whole number >= 1")
   return substeps

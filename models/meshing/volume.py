@@ -52,7 +52,7 @@ class Labels:
     return f"{count} voxels of {' x '.join(f'{edge:.3g}' for edge in edges)} mm{self.note}"
 
   def segment(self, label: int | str | None = None) -> Segment:
-    """Returns a label by number or name; None for the only one there is."""
+    """Returns the label of a number or name; None selects the only one."""
     listed = ", ".join(map(str, self.segments)) or "none"
     if label is None:
       fitting = list(self.segments)

@@ -24,7 +24,7 @@ from .worlds import Worlds
 
 
 class Several(Batch):
-  """A batch of batches.
+  """A batch whose worlds are on several devices.
 
   Args:
     spec: the scene

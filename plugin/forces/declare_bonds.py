@@ -45,7 +45,7 @@ def declare(bonds: Bonds, host: Host):
   """Bonds an organ to the bodies that its configuration names.
 
   Raises:
-    ValueError: it names what does not exist, or no vertex is near it.
+    ValueError: it names a body that does not exist, or no vertex is near one.
   """
   m = host.m
   flex_names = [flexes.name(m, f) for f in range(m.nflex)]

@@ -258,8 +258,8 @@ class System:
 class Lump:
   """Factors on Young's modulus of the triangles of each world; empty where worlds do not differ.
 
-  Those of a fan's triangles and of a hinge's two, and the bending matrix with them; of solids what
-  follows from those of the triangles nearest to tetrahedra.
+  There are factors of a fan's triangles and of a hinge's two, and the bending matrix with them.
+  Those of a solid's tetrahedra follow from the nearest triangles.
   """
 
   fan: floats("nlump", "nskinslot + nskinslice", 8)

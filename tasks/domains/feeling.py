@@ -251,7 +251,7 @@ def _gain(o, k, low):
 def chance(places: np.ndarray, felt: np.ndarray, more: np.ndarray, radius: float) -> np.ndarray:
   """Returns how likely an inclusion is under each place, against the likeliest [-]  (nplace,).
 
-  As likely as a bell of stiffness on it, h exp(-(d/w)^2) above what is soft, fits what was felt.
+  It is the likelihood of what was felt, given a bell of stiffness h exp(-(d/w)^2) above the soft.
 
   Args:
     places: where it may be  (nplace, 3) [m]

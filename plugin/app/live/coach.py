@@ -120,7 +120,7 @@ def _shown(value: float, spec: Spec) -> str:
 
 
 def _tells(spec: Spec, recording: Recording) -> bool:
-  """Returns whether a metric says something: an exercise that ends early is short for no merit."""
+  """Returns whether a metric is meaningful: an exercise that ends early is quick without merit."""
   return recording.outcome == SUCCESS or spec.group not in ("efficiency", "time")
 
 

@@ -100,7 +100,7 @@ class Kept:
 
 @dataclasses.dataclass(frozen=True)
 class Keeping:
-  """Where exercises are kept, and whose they are; goes to other processes as it is.
+  """Where exercises are kept, and for whom; it can be sent to other processes.
 
   Attributes:
     folder: of the record, None without one

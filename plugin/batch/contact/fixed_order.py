@@ -206,7 +206,7 @@ def _constraint_force(compact: bool, nv: int, deterministic: bool) -> wp.Kernel:
 
 @functools.cache
 def _compensation(deterministic: bool) -> wp.Kernel:
-  """Returns the kernel of what bears bodies against gravity, a thread a dof."""
+  """Returns the kernel of gravity compensation, a thread a dof."""
 
   @wp.kernel(module="unique", enable_backward=False)
   def compensation(

@@ -99,7 +99,7 @@ place, gather, scatter, leave, choose, foresee = coupling.kernels(
 
 @struct
 class Reshaping:
-  """What slots have of vertices, and the mesh that they are to have."""
+  """The slots' vertices, and the mesh that they are to take over."""
 
   nvert: int
   nelem: int

@@ -276,7 +276,7 @@ def let_sleep(w: Workspace, allowed: bool):
 def find_contacts_again(w: Workspace):
   """Does the position stage once more.
 
-  Inertias of others stay: an organ may have made its own greater in this step.
+  It keeps the inertias of all other dofs: another organ may have raised its own in this step.
   """
   m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
   other = np.ones(m.nv, bool)
