@@ -105,6 +105,13 @@ class Host(host.Host):
     """See `Host`."""
     return self._lifted
 
+  def open_contacts(self):
+    """See `Host`; worlds find theirs afterwards."""
+
+  def ties(self, flex: int) -> coupling.Ties:
+    """See `Host`."""
+    return self._batch.rods.ties(flex)
+
   def tools(self, name: str) -> np.ndarray:
     """See `Host`."""
     return getattr(self._batch.d, name).numpy().astype(float)

@@ -220,9 +220,8 @@ class Organ(Tissue):
     self._over(patch.tell_tools, max(1, p.ntool))
     self._lay_lines()
     self._over(patch.enter, p.nnode)
-    if self.body.state.hold.size:
-      self.body.state.hold.zero_()
-    self.forces.enter()
+    if not self.sews:
+      self._enter()
     some = min(p.nnode, _RANKED * p.nslot)  # threads, for as many candidates as there mostly are
     self._over(patch.rank, some)
     self._over(patch.stand, max(some, p.nslot))
@@ -230,7 +229,25 @@ class Organ(Tissue):
       dim, device = (self.batch.nworld, p.nslot), self.body.device
       inputs = [p, self.batch.d.qacc_warmstart]
       wp.launch(contacts.lead, dim=dim, inputs=inputs, device=device)
-    self._scheme.step(self.body)
+    if not self.sews:
+      self._scheme.step(self.body)
+
+  def _enter(self):
+    if self.body.state.hold.size:
+      self.body.state.hold.zero_()
+    self.forces.enter()
+
+  @property
+  def sews(self) -> bool:
+    """Whether it holds threads, whose steps its own waits for."""
+    return self._pierced.sews
+
+  def follow_threads(self):
+    """Takes the tissue's step after those of threads."""
+    if self.sews:
+      self._pierced.lead()
+      self._enter()
+      self._scheme.step(self.body)
 
   def touch(self):
     """Writes the window's contacts."""

@@ -1,7 +1,8 @@
 """Threads in the worlds of a batch on a device: each world has a `Rod`, and kernels take them all.
 
 mujoco_warp has a thread's nodes as bodies and finds its contacts with geoms. Between its rows of
-constraints and its solver the thread takes its step (`coupling/world_rods.h`).
+constraints and its solver the thread takes its step (`coupling/world_rods.h`), and after it an
+organ through which it goes.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -13,6 +14,7 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.engine import rods
+from palpate.engine.coupling import Ties
 from palpate.engine.rods import Rod
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, doubles, fill, floats, ints, struct
@@ -104,7 +106,11 @@ def bytes_of(space: rods.Workspace) -> float:
 
 
 class Thread(base.Thread):
-  """A thread of `Worlds`."""
+  """A thread of `Worlds`.
+
+  Attributes:
+    ties: what organs hold it by
+  """
 
   def __init__(self, batch: "Worlds", space: rods.Workspace):
     organ, bare, device, nworld = space.organ, batch.bare, batch.device, batch.nworld
@@ -127,6 +133,8 @@ class Thread(base.Thread):
       name: _rows(Rod, name, start, nworld, device) for name, start in rods.scratch(n).items()
     }
     self.iterations = each["status"]
+    self.ties = Ties(nworld, device)
+    each |= self.ties.arrays
     values: dict[str, Any] = dict(
       rods=_stack(shared | each | {"own": own}, nworld, device),
       nv=bare.nv,
@@ -264,6 +272,16 @@ class Rods:
         "dim", "flex", "worldid", "dist", "includemargin", "friction", "solref", "solimp",
         "efc_address")},
     ))  # fmt: skip
+
+  def ties(self, flex: int) -> Ties:
+    """Returns what holds the thread of a flex of the compiled model."""
+    (found,) = (each.ties for each in self.all.values() if each.declared.flex == flex)
+    return found
+
+  def aim(self):
+    """Lets threads know what holds them, as a step begins."""
+    for each in self.all.values():
+      each.ties.aim()
 
   def begin(self):
     """Takes the threads' steps, once there are rows of constraints."""

@@ -224,9 +224,14 @@ class Worlds(Batch):
     def push(m, d):
       if self._order:
         self._order.sort()
+      sewn = any(organ.sews for organ in organs)
+      if sewn:
+        self.rods.begin()
       for organ in organs:
+        organ.follow_threads()
         organ.push()
-      self.rods.begin()
+      if not sewn:
+        self.rods.begin()
       if self.weighs:
         mjw.factor_m(m, d)
 
@@ -239,6 +244,7 @@ class Worlds(Batch):
       mjw.kinematics(self.m, self.d)
       mjw.com_pos(self.m, self.d)
       mjw.com_vel(self.m, self.d)
+    self.rods.aim()
     for organ in self._organs.values():
       organ.begin()
 

@@ -221,19 +221,23 @@ def mujoco_arrays(model: int, data: int, kind: Any = Mujoco):
 
 
 class Ties:
-  """What holds a thread in one mjData: arrays of `Rod`, filled anew as its step begins.
+  """What holds a thread, in one mjData or in all worlds of a batch, filled anew for each step.
 
   Attributes:
-    arrays: those, by name
+    arrays: arrays of `Rod` by name, a row a world
     aims: launches that add to them, by who does
     lead: lets the thread take its step before an organ's, given that's instance
     led: whether it has
   """
 
-  def __init__(self):
-    kinds: dict[str, tuple[Any, Any]] = {"tie_count": (1, int), "tie_edge": (MOST_TIES, int)}
+  def __init__(self, nworld: int = 1, device: Any = "cpu"):
+    kinds: dict[str, tuple[tuple[int, ...], Any]]
+    kinds = {"tie_count": ((1,), int), "tie_edge": ((MOST_TIES,), int)}
     kinds["tie_value"] = (MOST_TIES, len(layout.TIE)), wp.float64
-    self.arrays = {n: wp.zeros(s, dtype=kind, device="cpu") for n, (s, kind) in kinds.items()}
+    self.arrays = {
+      name: wp.zeros((nworld, *shape), dtype=kind, device=device)
+      for name, (shape, kind) in kinds.items()
+    }
     self.aims: dict[Any, Callable[[], None]] = {}
     self.lead: Callable[[int], None] = lambda instance: None
     self.led = False

@@ -122,8 +122,12 @@ class Host(host.Host):
     return self._surface
 
   def open_contacts(self):
-    """Opens the contacts that forces say are none, see `lifted`."""
+    """See `Host`."""
     contacts.lift.launch("cpu", 1, 1, 0, self.weights)
+
+  def ties(self, flex: int) -> coupling.Ties:
+    """See `Host`."""
+    return coupling.ties(self.data, flex)
 
   def lifted(self) -> wp.array:
     """See `Host`."""

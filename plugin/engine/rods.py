@@ -258,9 +258,6 @@ def scratch(n: int) -> dict[str, np.ndarray]:
     row_kind=np.zeros(rows),
     row_node=np.zeros(rows),
     row_value=np.zeros((rows, 9)),
-    tie_count=np.zeros(1),
-    tie_edge=np.zeros(coupling.MOST_TIES),
-    tie_value=np.zeros((coupling.MOST_TIES, len(layout.TIE))),
   )
 
 
@@ -328,7 +325,8 @@ class Workspace:
     values = self.constants | settings(organ, self.friction) | scratch(n)
     self.ties = coupling.ties(self.data, organ.flex)
     self.ties.lead = self._lead
-    values |= {"mass": mass, "own": self.own} | self.ties.arrays
+    values |= {"mass": mass, "own": self.own}
+    values |= {name: array[0] for name, array in self.ties.arrays.items()}
     own = fill(Rod, "cpu", values)
     values = dict(
       rod=own,

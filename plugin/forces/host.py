@@ -22,7 +22,7 @@ from palpate.tissue.order import LANES
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import DIMS, Array, doubles, fill, floats, ints, struct, vector
 
-from ..engine.coupling import CONSTANTS
+from ..engine.coupling import CONSTANTS, Ties
 from ..engine.model import mjstruct
 
 if TYPE_CHECKING:
@@ -213,6 +213,14 @@ class Host(abc.ABC):
   @abc.abstractmethod
   def lifted(self) -> wp.array:
     """Returns where forces say what does not touch the organ, see `contacts.lifted`, by world."""
+
+  @abc.abstractmethod
+  def open_contacts(self):
+    """Opens those of contacts that are found before forces say so."""
+
+  @abc.abstractmethod
+  def ties(self, flex: int) -> Ties:
+    """Returns what holds the thread of a flex."""
 
   @abc.abstractmethod
   def tools(self, name: str) -> np.ndarray:

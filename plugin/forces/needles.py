@@ -16,7 +16,7 @@ from palpate.tissue import config as configuration
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import doubles, ints, struct
 
-from ..engine import contacts, coupling
+from ..engine import contacts
 from ..engine.layout import HOLE, HOLES, NEEDLE, PIERCE, TIE
 from ..engine.model import declare, flexes, mjstruct
 from .declare_attachments import find_body, most
@@ -88,10 +88,10 @@ class Held:
   pierced: Pierced
   frame: doubles(3, 3)  # rotation from the axes of the thread's slides to the world
   origin: doubles(3)  # position of its frame [m]
-  first: ints(1)  # the first of these
-  tie_count: ints(1)  # see `coupling.Ties`
-  tie_edge: ints("ntie")
-  tie_value: doubles("ntie", len(TIE))
+  first: ints("nworld")  # the first of these
+  tie_count: ints("nworld", 1)  # see `coupling.Ties`
+  tie_edge: ints("nworld", "ntie")
+  tie_value: doubles("nworld", "ntie", len(TIE))
 
 
 _enter, _act, _keep = kernels(
@@ -210,11 +210,6 @@ class Needles(Force):
   def take(self, declared: "Needles", twin: Any):
     """See `Force`."""
     if declared:
-      if not self.host.alone and any(each["flex"] >= 0 for each in declared._threads):
-        raise ValueError(
-          f"organ {self.host.organ.name!r}: needles names one with a thread, which a batch on a "
-          "GPU cannot hold in its holes yet"
-        )
       self.names, self._shape = declared.names, dict(declared._shape)
       self._threads = declared._threads
       self._slit, self._margin = declared._slit, declared._margin
@@ -282,16 +277,16 @@ class Needles(Force):
     )  # fmt: skip
     self.fields = host.fill(Pierced, values, into=self.fields)
     self.refresh()
-    for k, thread in enumerate(self._threads if host.alone else ()):
+    for k, thread in enumerate(self._threads):
       if thread["flex"] >= 0:
         self._hold(k, thread)
 
   def _hold(self, k: int, thread: dict):
     """Lets the step of a thread know what holds it."""
     host = self.host
-    ties = coupling.ties(host.data, thread["flex"])
+    ties, first = host.ties(thread["flex"]), host.zeros(dtype=int)
     frame = {"frame": thread["frame"], "origin": thread["origin"]}
-    held = host.fill(Held, {"pierced": self.fields, "first": np.zeros(1)} | frame | ties.arrays)
+    held = host.fill(Held, {"pierced": self.fields, "first": first} | frame | ties.arrays)
     self._held[k] = held
     host.load(_aim)
 
@@ -301,10 +296,15 @@ class Needles(Force):
 
     ties.aims[host.instance, k] = aim
 
+  @property
+  def sews(self) -> bool:
+    """Whether it holds threads: these take their steps before the organ, which bears that."""
+    return bool(self._held)
+
   def lead(self):
-    """Lets threads take their steps first, of one world: the tissue bears what holds them then."""
+    """Takes the forces of the threads' steps, which these take first."""
     for k, held in self._held.items():
-      coupling.ties(self.host.data, self._threads[k]["flex"]).lead(self.host.instance)
+      self.host.ties(self._threads[k]["flex"]).lead(self.host.instance)
       self.host.launch(_feel, held, arg=k)
 
   def sew(self, name: str, x: np.ndarray):

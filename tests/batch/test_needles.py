@@ -134,3 +134,45 @@ def test_an_organ_without_needles_says_so():
   worlds = palpate.batch.make(mujoco.MjSpec.from_string(press(subdivisions=1)), 1, "cpu")
   with pytest.raises(ValueError, match="nothing goes through it, expected the key needles"):
     worlds.organ("organ").needles  # noqa: B018
+
+
+@SLOW
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_thread_slides_through_its_hole_as_under_the_plugin(device):
+  """It is held up to what the capstan's law says, and slides from there on."""
+  mu, nodes = 0.3, 24
+  suture = {"contact": {"friction": mu}}
+  given = {"pos": (0.017, 0, 0), "needles": f"needle {one.ENERGY}", "foundation": 3e7}
+  spec = one.scene(nodes=nodes, suture=suture, **given)
+  spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # the hole alone
+  model, data, organ = one.load(spec)
+  one.drive(model, data, organ, [5.0])
+  worlds = palpate.batch.make(spec, 2, device)
+  tail = np.array([0.98, 0, 0.2])
+  for _ in one.pull(model, data, {nodes - 1: 0.3 * tail}, 0.001, 1.0, 400):
+    pass
+  ends = [data.body(f"suture_{node}").xpos for node in range(2)]
+  head = (ends[0] - ends[1]) / np.linalg.norm(ends[0] - ends[1])
+  data.eq_active[:] = 0
+  for _ in one.pull(model, data, {0: 0.3 * head}, 1.0, 1.0, 100):
+    pass
+  worlds.set_state(1, data)
+  worlds.ctrl = np.stack([0 * data.ctrl, data.ctrl])
+  at = [worlds.bare.body(f"suture_{node}").id for node in (0, nodes - 1)]
+  tissue, start, slid = worlds.organ("organ"), organ.pinholes[0].along, [0.0, 0.0]
+  for k, _ in enumerate(one.pull(model, data, {0: 0.3 * head}, 1.0, 1.8, 300)):
+    held = 1.0 + 0.8 * k / 300
+    applied = worlds.d.xfrc_applied.numpy()
+    applied[1, at, :3] = 0.3 * held * head, 0.3 * tail
+    worlds.d.xfrc_applied.assign(applied)
+    worlds.step()
+    found = float(tissue.needles.hole_along.numpy()[1, 0, 0])
+    for each, along in enumerate((organ.pinholes[0].along, found)):
+      slid[each] = slid[each] or held * (abs(along - start) > 2e-4)
+    if all(slid):
+      break
+    force = tissue.needles.hole_force.numpy()[1, 0, 0]
+    np.testing.assert_allclose(force, organ.pinholes[0].force, atol=0.02)
+  angle = np.arccos(-(tail @ head) / np.linalg.norm(tail))
+  np.testing.assert_allclose(slid, np.exp(mu * angle), rtol=0.03)
+  assert worlds.organ("organ").needles.count.numpy().tolist() == [[0], [1]]

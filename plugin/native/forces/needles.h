@@ -51,6 +51,14 @@ PALPATE Fields of_world(Fields f, int world) {
   return f;
 }
 
+// The same of a needle whose thread is held.
+template <class Fields>
+PALPATE Fields held_in_world(Fields f, int world) {
+  f.pierced = of_world(f.pierced, world);
+  move_each(world, f.first, f.tie_count, f.tie_edge, f.tie_value);
+  return f;
+}
+
 // A needle where it is now.
 struct Arc {
   D3 at, x, y;
@@ -476,7 +484,8 @@ PALPATE void lift_contacts(const Fields& f, int i, const Arc& arc, double* s) {
 
 // Says what holds a needle's thread, as the step begins: the points of the tissue where they will be.
 template <class Fields>
-PALPATE void aim_thread(const Fields& all, Thread t, int i) {
+PALPATE void aim_thread(const Fields& given, Thread t, int i) {
+  const Fields all = held_in_world(given, t.world);
   const auto& f = all.pierced;
   double s[NEEDLE_LENGTH];
   for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
@@ -505,7 +514,8 @@ PALPATE void aim_thread(const Fields& all, Thread t, int i) {
 
 // Takes the forces that the thread's step has found, in the order in which it was told what holds it.
 template <class Fields>
-PALPATE void feel_thread(const Fields& all, Thread t, int i) {
+PALPATE void feel_thread(const Fields& given, Thread t, int i) {
+  const Fields all = held_in_world(given, t.world);
   const auto& f = all.pierced;
   double s[NEEDLE_LENGTH];
   for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
