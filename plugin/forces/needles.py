@@ -30,6 +30,7 @@ _FIRM = 10.0
 _MARGIN, _POINT = 3.0, 0.1
 _BESIDE = 1.4  # the same of a thread beside a hole, to before where contacts begin
 _ENDS = ("swage", "tip")
+_SAME = 1e-6  # edges of a thread within which two places where it goes through are one
 # As in the header.
 _POINTS = HOLES + 1
 _TOUCHING, _INSIDE = 1, 2
@@ -326,7 +327,11 @@ class Needles(Force):
     if not len(nodes):
       raise ValueError(f"{what} has no thread, expected one that `add_needle` has joined")
     line = np.stack([host.body_frame(int(body))[1] for body in nodes])
-    rows = _crossings(line, x[host.organ.mesh.elem])
+    found = sorted(_crossings(line, x[host.organ.mesh.elem]))
+    # Through an edge or a corner it goes once.
+    rows = [
+      row for row, last in zip(found, [(-1.0,), *found], strict=False) if row[0] > last[0] + _SAME
+    ]
     if not 0 < len(rows) <= HOLES:
       raise ValueError(
         f"{what} has a thread that goes through the surface {len(rows)} times, expected 1 to "
@@ -334,15 +339,16 @@ class Needles(Force):
       )
     length = self._threads[k]["edges"][:-1, 0]
     before = np.r_[0.0, np.cumsum(length)]
+    along = np.interp([row[0] for row in rows], np.arange(len(before)), before)
     state = self.fields.state.numpy()[0, k]
     state[:] = 0.0
     state[NEEDLE.count] = len(rows)
     solid = host.config.elements == "solid"
-    for h, (edge, part, elem, v, w, against) in enumerate(sorted(rows, reverse=True)):
+    for h, (place, (_, *seat, against)) in enumerate(zip(along[::-1], rows[::-1], strict=True)):
       hole = state[NEEDLE.hole + len(HOLE) * h :][: len(HOLE)]
       hole[HOLE.kind] = (_INTO if against else _OUT) if solid else _THROUGH
-      hole[HOLE.elem : HOLE.elem + 3] = elem, v, w
-      hole[HOLE.thread] = before[edge] + part * length[edge]
+      hole[HOLE.elem : HOLE.elem + 3] = seat
+      hole[HOLE.thread] = place
 
   def refresh(self, tissue: np.ndarray | None = None, thickness: Any = None):
     """Takes the material that there is now.
@@ -504,7 +510,7 @@ def _pairs(m) -> np.ndarray:
   return np.stack(ids, axis=1)
 
 
-def _crossings(line: np.ndarray, x: np.ndarray) -> list[tuple[int, float, int, float, float, bool]]:
+def _crossings(line: np.ndarray, x: np.ndarray) -> list[tuple[float, int, float, float, bool]]:
   """Returns where a line goes through triangles.
 
   Args:
@@ -512,7 +518,7 @@ def _crossings(line: np.ndarray, x: np.ndarray) -> list[tuple[int, float, int, f
     x: corners of the triangles [m]        (nelem, 3, 3)
 
   Returns:
-    of each place the line's edge and the share of it, the triangle, the shares of its last two
+    of each place the line's edge plus the share of it, the triangle, the shares of its last two
     corners, and whether one who comes from the line's end goes against its normal
   """
   out = []
@@ -525,7 +531,7 @@ def _crossings(line: np.ndarray, x: np.ndarray) -> list[tuple[int, float, int, f
     v, w, t = (r * p).sum(axis=1) / det, (q @ way) / det, (g * q).sum(axis=1) / det
     found = (v >= 0) & (w >= 0) & (v + w <= 1) & (t >= 0) & (t <= 1)
     for i in np.flatnonzero(found).tolist():
-      out.append((k, float(t[i]), i, float(v[i]), float(w[i]), bool(det[i] < 0)))
+      out.append((k + float(t[i]), i, float(v[i]), float(w[i]), bool(det[i] < 0)))
   return out
 
 

@@ -396,6 +396,23 @@ def test_stitches_close_a_cut_that_are_pulled_tight_one_after_the_other():
     assert crossing(thread).sum() > 2 * half * tension  # it carries what the cut does not
 
 
+def test_a_thread_is_sewn_through_a_solid():
+  """It goes in where it comes from its end, and out toward the needle."""
+  model, data, organ = load(scene(solid=True, height=0.03, nodes=60))
+  thread = palpate.Thread(model, data, "suture")
+  before = thread.positions
+  thread.lay([before[0], (-0.03, 0, 0.005), (0.05, 0, 0.005)])
+  edges = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (before, thread.positions)]
+  np.testing.assert_allclose(*edges, rtol=1e-9)
+  organ.sew("needle")
+  entry, out = organ.pinholes
+  assert entry.rest[0] > 0.02 and out.rest[0] < -0.02
+  assert entry.along < out.along < 0
+  mujoco.mj_step(model, data, 50)
+  assert len(organ.pinholes) == 2
+  assert organ.error is None and thread.error is None
+
+
 def test_what_cannot_be_sewn_is_told():
   for nodes, name, message in (
     (0, "pin", "needle 'pin' is none of its own, expected one of needle"),
@@ -405,6 +422,14 @@ def test_what_cannot_be_sewn_is_told():
     organ = load(scene(nodes=nodes))[2]
     with pytest.raises(ValueError, match=message):
       organ.sew(name)
+  spec = mujoco.MjSpec()
+  palpate.add_thread(spec, np.linspace((0, 0, 0), (0.01, 0, 0), 8), pin=[0])
+  model = spec.compile()
+  thread = palpate.Thread(model, mujoco.MjData(model), "thread")
+  with pytest.raises(
+    ValueError, match="thread 'thread' has pinned nodes, expected one that is free"
+  ):
+    thread.lay([(0, 0, 0), (1, 0, 0)])
 
 
 @pytest.mark.parametrize("windows", [False, True])
