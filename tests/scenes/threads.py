@@ -45,6 +45,8 @@ def tangle(seed, segment):
     ends = np.linspace(0.0, 0.015, 60)[1:, None] * (1, 0, 0)
     curve = np.concatenate([(curve[0] - ends)[::-1], curve, curve[-1] + ends])
     points = resampled(curve, segment)
+    if np.linalg.norm(np.diff(points, axis=0), axis=1).min() < RADIUS:
+      continue  # it turns more sharply than a thread can
     near = nearest(points) < 2.3 * RADIUS
     if not near and nearest(resampled(curve, RADIUS), between=8) > 1.6 * RADIUS:
       return points
