@@ -175,13 +175,29 @@ def _slots(
 def _followed(m: mjstruct.Struct, name: str, config: Config, flex: int) -> np.ndarray:
   """Returns the geoms that a window follows: of the bodies named, or all that move and collide.
 
-  An organ that nothing holds may fall on what stands still: its window follows that too.
+  An organ that nothing holds may fall on what stands still: its window follows that too. Tips of
+  needles wake it, whether they collide or not.
   """
+  tools, tips = _tools(m, name, config, flex), _tips(m, name, config)
+  return np.array(tools + [g for g in tips if g not in tools], np.int64)
+
+
+def _tips(m: mjstruct.Struct, name: str, config: Config) -> list[int]:
+  """Returns the last geom of each needle that goes through an organ: that of its tip."""
+  bodyid = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
+  names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
+  found = [flexes.resolve(row.name, name, names) for row in config.needles]
+  geoms = [np.flatnonzero(bodyid == names.index(body)) for body in found if body is not None]
+  return [int(each[-1]) for each in geoms if len(each)]
+
+
+def _tools(m: mjstruct.Struct, name: str, config: Config, flex: int) -> list[int]:
+  """Returns the geoms that collide with a window and that it follows."""
   bodyid = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
   meets = flexes.meeting_geoms(m, flex)
   if not config.follow:
     weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)
-    return np.array([g for g in meets if weld[bodyid[g]] or not config.held], np.int64)
+    return [g for g in meets if weld[bodyid[g]] or not config.held]
   names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
   wanted = set()
   for body in config.follow:
@@ -194,7 +210,7 @@ def _followed(m: mjstruct.Struct, name: str, config: Config, flex: int) -> np.nd
         "window, expected bodies with geoms"
       )
     wanted.add(names.index(found))
-  return np.array([g for g in meets if bodyid[g] in wanted], np.int64)
+  return [g for g in meets if bodyid[g] in wanted]
 
 
 def _lines(model: int, m: mjstruct.Struct, instance: int, config: Config, flex: int) -> np.ndarray:
