@@ -184,6 +184,7 @@ HOLE = Numbers(
   ("share", 3, "-", "of the corners but the first"),
   ("slip", 1, "m", "place on the needle at which friction is at rest"),
   ("thread", 1, "m", "place on the thread, from the needle on; 0 while the needle is in it"),
+  ("torn", 1, "m", "how far it has torn through the tissue"),
 )
 
 # Of the plugin state: a needle, see `forces/needles.h`.
@@ -205,6 +206,7 @@ PIERCE = Numbers(
   ("surface", 1, "N", "that the surface of a solid bears"),
   ("friction", 1, "N/m", "by length in tissue"),
   ("stiffness", 1, "N/m", "of what ties it to a hole"),
+  ("tear", 1, "N/m", "that tissue bears across it, by length"),
   ("capstan", 1, "-", "friction of its thread around the edge of a hole"),
   ("wall", 1, "m", "thickness of a sheet, 0 of a solid"),
   ("clear", 1, "m", "how far a tip is off its seat before it may skid"),
@@ -221,7 +223,9 @@ TIE = Numbers(
   ("stiffness", 1, "N/m", "of the spring"),
   ("friction", 1, "N", "what that bears along the thread"),
   ("along", 3, "-", "which way that is"),
+  ("bears", 1, "N", "what holds it across"),
   ("force", 3, "N", "on the thread, of the step"),
+  ("torn", 3, "m", "how far that has torn what holds it"),
 )
 
 # The last numbers of the plugin state of a windowed organ.

@@ -13,14 +13,16 @@ from typing import Any
 import mujoco
 import numpy as np
 from palpate.tissue import config as configuration
+from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import doubles, ints, struct
 
 from ..engine import contacts
 from ..engine.layout import HOLE, HOLES, NEEDLE, PIERCE, TIE
 from ..engine.model import declare, flexes, mjstruct
+from . import transfer
 from .declare_attachments import find_body, most
-from .host import Bodies, Host, Input, Nodes, kernels
+from .host import Bodies, Host, Input, Nodes, edited, kernels
 from .passive import Force
 
 # Stiffness of what ties a needle to a hole, over that of the tissue there.
@@ -76,6 +78,7 @@ class Pierced:
   hold: doubles("nworld", "nneedle", _POINTS, 6)  # what weighs on the change of velocity there [kg]
   feels: ints("nworld", "nneedle", _POINTS)  # whether the needle feels the force
   pull: doubles("nworld", "nneedle", _POINTS, 3)  # of a thread, in the organ's frame [N]
+  torn: doubles("nworld", "nneedle", _POINTS, 3)  # how far that has torn in its step, there [m]
   weight: doubles("nworld", "nneedle")  # what all of them weigh on the needle [kg]
   own: Nodes
   solve: Input
@@ -113,6 +116,7 @@ class Pinhole:
     rest: the same at rest                                  (3,)
     along: how far along the needle it is, from the swage; on the thread negative [m]
     force: on the organ in the last step, in the world [N]  (3,)
+    torn: how far it has torn through the tissue [m]
   """
 
   needle: str
@@ -122,6 +126,7 @@ class Pinhole:
   rest: np.ndarray
   along: float
   force: np.ndarray
+  torn: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,6 +171,7 @@ class Needles(Force):
     self._held: dict[int, Any] = {}  # `Held` of the needles that have one
     self._slit = np.zeros(0)  # width of what a tip opens [m]
     self._margin = np.zeros(0)  # see `PIERCE.margin` [m]
+    self._before: dict[int, Mesh] = {}  # meshes of worlds that are being cut
 
   def __bool__(self) -> bool:
     return bool(self.names)
@@ -238,6 +244,7 @@ class Needles(Force):
       out[:, k, PIERCE.stiffness] = np.minimum(
         _FIRM * stiffness, np.inf if free else most(host, bodies[k])
       )
+      out[:, k, PIERCE.tear] = row.energy
       out[:, k, PIERCE.capstan] = self._threads[k]["friction"]
       out[:, k, PIERCE.wall] = 0.0 if config.elements == "solid" else thickness
       out[:, k, PIERCE.clear] = self._slit[k]
@@ -261,7 +268,7 @@ class Needles(Force):
     if not self:
       return
     host, n = self.host, len(self.names)
-    widths = {"force": 3, "point": 3, "pull": 3, "share": 4, "hold": 6}
+    widths = {"force": 3, "point": 3, "pull": 3, "torn": 3, "share": 4, "hold": 6}
     values: dict[str, Any] = {name: host.zeros(n, _POINTS, w) for name, w in widths.items()}
     values |= self._shape | host.surface() | dict(
       nneedle=n,
@@ -366,6 +373,29 @@ class Needles(Force):
     law = self._law(tissue[:, contacts.TISSUE.asked], thickness)
     self.fields.law.assign(np.broadcast_to(law, self.fields.law.shape))
 
+  # Its holes follow cuts.
+
+  def carry(self, world: int, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """See `Force`."""
+    if self:
+      self._before[world] = self.host.mesh(world)
+
+  def reshape(self, world: int):
+    """See `Force`: holes stay where they are in the tissue, those that a cut went through open."""
+    was = self._before.pop(world, None)
+    if was is None:  # a state that was set has holes of its mesh
+      return
+    mesh = self.host.mesh(world)
+    with edited(self.fields.state, world) as state:
+      for row, slit in zip(state, self._slit, strict=True):
+        rows = row[NEEDLE.hole :].reshape(HOLES, len(HOLE))
+        count = int(row[NEEDLE.count])
+        kept = [h for h in range(count) if _stays(was, mesh, rows[h], slit)]
+        rows[: len(kept)] = rows[kept]
+        row[NEEDLE.count] = len(kept)
+        if row[NEEDLE.stage]:
+          _find_again(was, mesh, row[NEEDLE.elem :], bool(row[NEEDLE.stage] == _INSIDE))
+
   def read(self, x: np.ndarray) -> list[Needle]:
     """Returns what the needles do, of one world, with vertices at places [m], (nvert, 3)."""
     if not self:
@@ -379,12 +409,12 @@ class Needles(Force):
       holes = []
       for h in range(int(row[NEEDLE.count])):
         hole = row[NEEDLE.hole + len(HOLE) * h :]
-        vert, share = _corners(mesh, hole)
-        at = share @ x[vert]
         within, thread = bool(hole[HOLE.kind] == _WITHIN), float(hole[HOLE.thread])
+        vert, share = _corners(mesh, hole[HOLE.elem :], within)
+        at = share @ x[vert]
         along = -thread if thread > 0 else self._along(k, at)
         place = at, share @ rest[vert], along
-        holes.append(Pinhole(name, within, thread > 0, *place, force[k, h]))
+        holes.append(Pinhole(name, within, thread > 0, *place, force[k, h], float(hole[HOLE.torn])))
       stage, energy = row[[NEEDLE.stage, NEEDLE.work]]
       whole, tip = force[k].sum(axis=0), force[k, HOLES]
       told = stage == _TOUCHING, stage == _INSIDE, whole, tip, float(energy), tuple(holes)
@@ -399,12 +429,42 @@ class Needles(Force):
     return float((np.arctan2(y, x) + half) * circle)
 
 
-def _corners(mesh: Mesh, hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the vertices of a hole's triangle or tetrahedron, and their shares."""
-  elem, share = int(hole[HOLE.elem]), hole[HOLE.elem + 1 : HOLE.elem + 4]
-  if hole[HOLE.kind] != _WITHIN:
+def _corners(mesh: Mesh, seat: np.ndarray, inside: bool) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the vertices of a seat's triangle or tetrahedron, and their shares."""
+  elem, share = int(seat[0]), seat[1:4]
+  if not inside:
     return mesh.elem[elem], np.array([1 - share[:2].sum(), *share[:2]])
   return mesh.tet[elem], np.array([1 - share.sum(), *share])
+
+
+def _find_again(was: Mesh, mesh: Mesh, seat: np.ndarray, inside: bool) -> np.ndarray:
+  """Puts a seat where it was in the tissue before a cut; returns that place at rest [m]."""
+  vert, share = _corners(was, seat, inside)
+  at = share @ was.rest[vert]
+  if not inside:
+    elem = np.array([int(seat[0])])
+    elem, weight = transfer.found_again(mesh, elem, share[None], was.rest[vert][None])
+    seat[:3] = elem[0], *weight[0, 1:]
+  elif (mesh.rest[mesh.tet[int(seat[0])]] != was.rest[vert]).any():
+    x = mesh.rest[mesh.tet] - at
+    edges = (x[:, 1:] - x[:, :1]).transpose(0, 2, 1)
+    shares = np.linalg.solve(edges, -x[:, 0, :, None])[..., 0]
+    tet = int(np.minimum(shares.min(axis=1), 1 - shares.sum(axis=1)).argmax())
+    seat[:4] = tet, *shares[tet]
+  return at
+
+
+def _stays(was: Mesh, mesh: Mesh, hole: np.ndarray, slack: float) -> bool:
+  """Puts a hole where it was; returns whether a sheet has not come apart within a slack."""
+  inside = bool(hole[HOLE.kind] == _WITHIN)
+  at = _find_again(was, mesh, hole[HOLE.elem :], inside)
+  if len(mesh.tet):
+    return True
+  rim = np.flatnonzero((mesh.twin < 0) & (mesh.whole.twin >= 0))
+  start, stop = (mesh.rest[topology.corners(mesh, rim, k)] for k in (0, 1))
+  way, arm = stop - start, at - start
+  share = np.clip((arm * way).sum(axis=1) / (way * way).sum(axis=1), 0, 1)
+  return bool((np.linalg.norm(arm - share[:, None] * way, axis=1) > slack).all())
 
 
 def _is_free(m, body: int) -> bool:

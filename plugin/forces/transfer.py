@@ -84,7 +84,6 @@ class Spots:
 
   def __init__(self, mesh: Mesh, elem: np.ndarray, weight: np.ndarray):
     self._elem, self._weight, self._rest = elem, weight, mesh.rest[mesh.elem[elem]]
-    self._at = np.einsum("nk,nkj->nj", weight, self._rest)
 
   def now(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns where they are in a mesh of the same whole.
@@ -93,13 +92,29 @@ class Spots:
       vertices (n, 3) and their weights (n, 3), and what turns the axes of the triangles that they
       were in to those of the ones that they are in now (n, 3, 3)
     """
-    elem, weight = self._elem.copy(), self._weight.copy()
-    moved = (mesh.rest[mesh.elem[elem]] != self._rest).any(axis=(1, 2))
-    if moved.any():
-      elem[moved], weight[moved], _ = paths.nearest(mesh, mesh.rest, self._at[moved])
+    elem, weight = found_again(mesh, self._elem, self._weight, self._rest)
     corner = mesh.elem[elem]
     was, now = axes(self._rest), axes(mesh.rest[corner])
     return corner, weight, now @ was.transpose(0, 2, 1)
+
+
+def found_again(
+  mesh: Mesh, elem: np.ndarray, weight: np.ndarray, rest: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+  """Returns triangles and weights of points that were in triangles of the same whole.
+
+  Args:
+    mesh: the mesh
+    elem: the triangles            (n,)
+    weight: of their corners       (n, 3)
+    rest: where these were [m]     (n, 3, 3)
+  """
+  elem, weight = elem.copy(), weight.copy()
+  moved = (mesh.rest[mesh.elem[elem]] != rest).any(axis=(1, 2))
+  if moved.any():
+    at = np.einsum("nk,nkj->nj", weight[moved], rest[moved])
+    elem[moved], weight[moved], _ = paths.nearest(mesh, mesh.rest, at)
+  return elem, weight
 
 
 def axes(corner: np.ndarray) -> np.ndarray:

@@ -72,13 +72,14 @@ PALPATE double enters(const Fields& f, Thread me, const Line& s, int& elem, D3& 
                        [&](const D3*, double at) { return at < s.length - at ? at : s.length - at; });
 }
 
-// Finds the point of the surface at rest that is nearest to a place: its triangle and weights.
-template <class Fields>
-PALPATE void find_seat(const Fields& f, Thread me, D3 place, int& elem, D3& weight) {
+// Finds the point of the surface that is nearest to a place, with the triangles' corners as given: its triangle and
+// weights; returns how far it is.
+template <class Fields, class Corners>
+PALPATE double find_nearest(const Fields& f, Thread me, D3 place, int& elem, D3& weight, Corners corners) {
   double least = NOWHERE;
   for (int t = me.tid; t < f.nelem; t += me.nthread) {
     D3 x[3];
-    corners_at_rest(f, t, x);
+    corners(f, t, x);
     const double far = norm(x[0] - place) - norm(x[1] - x[0]) - norm(x[2] - x[0]);
     if (far > 0.0 && far * far > least) continue;
     const D3 w = barycentric(place, x), off = blend(x, w) - place;
@@ -86,6 +87,11 @@ PALPATE void find_seat(const Fields& f, Thread me, D3 place, int& elem, D3& weig
     least = dot(off, off), elem = t, weight = w;
   }
   agree(least, elem, weight);
+  return sqrt(least);
+}
+template <class Fields>
+PALPATE void find_seat(const Fields& f, Thread me, D3 place, int& elem, D3& weight) {
+  find_nearest(f, me, place, elem, weight, [](const Fields& g, int t, D3* x) { corners_at_rest(g, t, x); });
 }
 
 // Where the seat of a blade is: triangle, weights, place now, and normal.
@@ -146,25 +152,34 @@ PALPATE Depth depth_of(const Fields& f, Thread me, int i, const Line& line, doub
   return {through ? least : in.length, through, in.along};
 }
 
-// Finds the tetrahedron that a place is in; returns whether there is one.
+// The least of a place's shares of the corners of a tetrahedron, negative where it is not in there.
+template <class Fields>
+PALPATE double depth_in_tet(const Fields& f, int t, D3 place, D3& w) {
+  D3 x[4];
+  for (int c = 0; c < 4; ++c) {
+    const int v = f.tet.data[4 * t + c];
+    x[c] = load(f.own.rest.data + 3 * v) + moved_by(f.mj, f.own, v) - place;
+  }
+  const D3 high = vmax(vmax(x[0], x[1]), vmax(x[2], x[3]));
+  if (high.x < 0.0 || high.y < 0.0 || high.z < 0.0) return -1.0;
+  const D3 a = x[1] - x[0], b = x[2] - x[0], c = x[3] - x[0], p = -1.0 * x[0];
+  const double det = dot(a, cross(b, c));
+  if (!(det > 0.0)) return -1.0;
+  w = (1.0 / det) * D3{dot(p, cross(b, c)), dot(a, cross(p, c)), dot(a, cross(b, p))};
+  double low = 1.0 - w.x - w.y - w.z;
+  const double shares[3] = {w.x, w.y, w.z};
+  for (int k = 0; k < 3; ++k) low = shares[k] < low ? shares[k] : low;
+  return low;
+}
+
+// Finds the tetrahedron that a place is in, which `tet` is likely to be; returns whether there is one.
 template <class Fields>
 PALPATE bool find_tet(const Fields& f, Thread me, D3 place, int& tet, D3& weight) {
+  if (depth_in_tet(f, tet, place, weight) > 0.0) return true;
   double least = NOWHERE;
   for (int t = me.tid; t < f.ntet; t += me.nthread) {
-    D3 x[4];
-    for (int c = 0; c < 4; ++c) {
-      const int v = f.tet.data[4 * t + c];
-      x[c] = load(f.own.rest.data + 3 * v) + moved_by(f.mj, f.own, v) - place;
-    }
-    const D3 high = vmax(vmax(x[0], x[1]), vmax(x[2], x[3]));
-    if (high.x < 0.0 || high.y < 0.0 || high.z < 0.0) continue;
-    const D3 a = x[1] - x[0], b = x[2] - x[0], c = x[3] - x[0], p = -1.0 * x[0];
-    const double det = dot(a, cross(b, c));
-    if (!(det > 0.0)) continue;
-    const D3 w = (1.0 / det) * D3{dot(p, cross(b, c)), dot(a, cross(p, c)), dot(a, cross(b, p))};
-    double low = 1.0 - w.x - w.y - w.z;
-    const double shares[3] = {w.x, w.y, w.z};
-    for (int k = 0; k < 3; ++k) low = shares[k] < low ? shares[k] : low;
+    D3 w;
+    const double low = depth_in_tet(f, t, place, w);
     if (low >= 0.0 && -low < least) least = -low, tet = t, weight = w;
   }
   agree(least, tet, weight);

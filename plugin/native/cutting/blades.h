@@ -220,9 +220,9 @@ PALPATE Borne take_hold(const Fields& f, Thread t, int i, const double* s, const
     if (t.tid == 0) f.share.data[HELD * i + c] = share, f.held.data[HELD * i + c] = v;
   };
   double left = 1.0;
+  int tet = 0;
   for (int k = 0; k < ALONG; ++k) {
     const D3 place = at.at + ((k + 0.5) / ALONG * depth.deep) * depth.in;
-    int tet = 0;
     D3 w = {0.0, 0.0, 0.0};
     const double part = spread && find_tet(f, t, place, tet, w) ? 1.0 / ALONG : 0.0;
     const double share[4] = {part * (1.0 - w.x - w.y - w.z), part * w.x, part * w.y, part * w.z};

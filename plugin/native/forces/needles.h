@@ -10,6 +10,10 @@
 // its thickness. Holes are held across the needle; along it each is dragged by friction, a force by length of the
 // needle in tissue (Okamura et al. 2004, doi:10.1109/TBME.2004.831542), that sticks or slips.
 //
+// Across it, tissue bears G of a needle or thread by its length there, as it does of a thin wire that cuts it (Goda et
+// al. 2024, arXiv:2412.02021), and of a short one what its tip took. Beyond that the hole tears through the tissue, by
+// a return mapping too, until it is out of its edge.
+//
 // Where the swage has gone through, a hole holds the thread by a spring to a place on it, which slips where it bears more
 // along the thread than friction: T (exp(mu theta) - 1), T the smaller one of the tensions on both sides and theta the
 // angle between them (the capstan's law), and that by length.
@@ -36,6 +40,7 @@ constexpr int BESIDE = 2;  // edges from the one that is in a hole to those that
 constexpr double HAIRPIN = 0.2;  // least share of a thread's friction along the mean of its directions, where it turns back
 constexpr double ENDS = 1e-9;   // share of a thread, or of its last edge, that is its end
 constexpr double STOPS = 1e6;   // what a bead there bears at a hole [N]
+constexpr double MISSES = 0.7;  // of its way, that a hole does not follow where it is torn out
 constexpr double TIGHT = 1e-9;  // of what tissue bears, to which a return mapping brings it
 constexpr double APART = 0.5;   // edges between holes in a solid, at least
 
@@ -44,7 +49,7 @@ PALPATE Fields of_world(Fields f, int world) {
   move_bodies(f.mj, world);
   move_nodes(f.own, world);
   move_input(f.solve, world);
-  move_each(world, f.state, f.next, f.law, f.force, f.point, f.share, f.held, f.hold, f.feels, f.pull, f.weight, f.lifted);
+  move_each(world, f.state, f.next, f.law, f.force, f.point, f.share, f.held, f.hold, f.feels, f.pull, f.torn, f.weight, f.lifted);
   move_to(f.mj.M, world);
   move_to(f.elem, f.mesh.data[world]), move_to(f.tet, f.mesh.data[world]);
   move_to(f.flat, f.mesh.data[world]);
@@ -172,7 +177,7 @@ PALPATE void make_hole(double* s, int kind, double place) {
   double* made = hole(s, count);
   made[HOLE_KIND] = kind;
   made[HOLE_SLIP] = place;
-  made[HOLE_THREAD] = 0.0;
+  made[HOLE_THREAD] = made[HOLE_TORN] = 0.0;
   for (int c = 0; c < 4; ++c) made[HOLE_ELEM + c] = s[NEEDLE_ELEM + c];
   s[NEEDLE_COUNT] = count + 1;
 }
@@ -213,7 +218,7 @@ PALPATE void touch(const Fields& f, Thread t, int i, const Arc& arc, D3 fast, do
 // Puts the seat of a tip in a solid on a place; returns whether that is in it.
 template <class Fields>
 PALPATE bool sit_inside(const Fields& f, Thread t, D3 place, double* s) {
-  int tet = 0;
+  int tet = s[NEEDLE_STAGE] == INSIDE ? (int)s[NEEDLE_ELEM] : 0;
   D3 w;
   if (!find_tet(f, t, place, tet, w)) return false;
   put_seat(s + NEEDLE_ELEM, tet, w);
@@ -329,21 +334,97 @@ PALPATE Passing passing(const Fields& f, int i, const Arc& arc, double place) {
   return out;
 }
 
+// Length in tissue at a hole: a sheet's thickness; in a solid half the way to each hole next to it, from the last one to
+// the tip all of it.
+template <class Fields>
+PALPATE double length_in(const Fields& f, int i, const Arc& arc, double* s, int n) {
+  const int count = (int)s[NEEDLE_COUNT], kind = kind_of(s, n);
+  const double wall = f.law.data[PIERCE_LENGTH * i + PIERCE_WALL];
+  if (on_thread(s, n)) {
+    const bool in = kind == INTO && n + 1 < count, out = kind == OUT && n > 0;
+    return in || out ? 0.5 * norm(seat_of_hole(f, s, n).at - seat_of_hole(f, s, in ? n + 1 : n - 1).at) : wall;
+  }
+  const double place = place_of_hole(f, arc, s, n);
+  const bool from = n > 0 && in_solid(kind_of(s, n - 1)), on = in_solid(kind);
+  const double before = from ? place_of_hole(f, arc, s, n - 1) : 0.0;
+  const double next = n + 1 < count ? place_of_hole(f, arc, s, n + 1) : 2.0 * arc.length - place;
+  return (kind == THROUGH ? wall : 0.0) + (from ? 0.5 * fabs(place - before) : 0.0) + (on ? 0.5 * fabs(next - place) : 0.0);
+}
+
+// What the tissue bears across a needle or a thread at a hole.
+template <class Fields>
+PALPATE double bears_across(const Fields& f, int i, const Arc& arc, double* s, int n) {
+  const double* law = f.law.data + PIERCE_LENGTH * i;
+  const double made = law[f.ntet && kind_of(s, n) != WITHIN ? PIERCE_SURFACE : PIERCE_FORCE];
+  const double cut = law[PIERCE_TEAR] * length_in(f, i, arc, s, n);
+  return cut > made ? cut : made;
+}
+
+// Lets a hole tear through the tissue by a way against what that bears; returns whether it is one still, rather than torn
+// out of the tissue's edge.
+template <class Fields>
+PALPATE bool tear_by(const Fields& f, Thread t, double* s, int n, D3 way, double bears) {
+  double* my = hole(s, n);
+  const D3 from = seat_of_hole(f, s, n).at, to = from + way;
+  int elem = (int)my[HOLE_ELEM];
+  D3 w;
+  if (kind_of(s, n) == WITHIN) {
+    if (!find_tet(f, t, to, elem, w)) return false;
+    put_seat(my + HOLE_ELEM, elem, w);
+  } else {
+    const double misses =
+      find_nearest(f, t, to, elem, w, [](const Fields& g, int e, D3* x) { corners_now(g, e, x); });
+    put_seat(my + HOLE_ELEM, elem, {w.y, w.z, 0.0});
+    if (misses > MISSES * norm(way)) return false;
+  }
+  const double went = norm(seat_of_hole(f, s, n).at - from);
+  my[HOLE_TORN] += went;
+  s[NEEDLE_WORK] += bears * went;
+  return true;
+}
+
+PALPATE void drop_hole(double* s, int n) {
+  s[NEEDLE_COUNT] -= 1.0;
+  for (; n < (int)s[NEEDLE_COUNT]; ++n)
+    for (int c = 0; c < HOLE_LENGTH; ++c) hole(s, n)[c] = hole(s, n + 1)[c];
+}
+
+// Lets holes that a needle pulls across by more than the tissue bears tear as far as that.
+template <class Fields>
+PALPATE void tear_holes(const Fields& f, Thread t, int i, const Arc& arc, double* s) {
+  for (int n = (int)s[NEEDLE_COUNT] - 1; n >= 0; --n) {
+    if (on_thread(s, n)) continue;
+    const D3 p = seat_of_hole(f, s, n).at;
+    const double place = arc.nearest(p), bears = bears_across(f, i, arc, s, n);
+    const D3 off = across(arc.place(place) - p, arc.along(place));
+    const double far = norm(off), goes = far - bears / f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
+    if (goes > 0.0 && !tear_by(f, t, s, n, (goes / far) * off, bears)) drop_hole(s, n);
+  }
+}
+
+// Lets those tear that a thread has torn in its step.
+template <class Fields>
+PALPATE void tear_by_thread(const Fields& f, Thread t, int i, const Arc& arc, double* s) {
+  for (int n = (int)s[NEEDLE_COUNT] - 1; n >= 0; --n) {
+    const D3 way = load(f.torn.data + 3 * (POINTS * i + n));
+    const double far = norm(way), most = f.edge < far ? f.edge / far : 1.0;
+    if (on_thread(s, n) && far > 0.0 && !tear_by(f, t, s, n, most * way, bears_across(f, i, arc, s, n))) drop_hole(s, n);
+  }
+}
+
 // What friction of a thread in a hole bears along it, of the difference of the tensions on both sides of the edge that is
 // in it.
 template <class Fields>
-PALPATE double thread_friction(const Fields& f, int i, const Passing& by, const Seat& seat, double* s, int n) {
+PALPATE double thread_friction(const Fields& f, int i, const Arc& arc, const Passing& by, const Seat& seat, double* s, int n) {
   const double* law = f.law.data + PIERCE_LENGTH * i;
   const auto thread = strand_of(f, i);
   const int e = by.edge;
   const bool last = e + 2 == thread.count;
   if (law[PIERCE_STOP] > 0.0 && last && by.part > 1.0 - ENDS && dot(by.at - seat.at, by.along) < 0.0) return STOPS;
   const double back = last ? 0.0 : thread.tension(e + 1), pull = thread.tension(e ? e - 1 : 0);
-  const bool in = kind_of(s, n) == INTO && n + 1 < (int)s[NEEDLE_COUNT], out = kind_of(s, n) == OUT && n > 0;
-  const double length = in || out ? 0.5 * norm(seat.at - seat_of_hole(f, s, in ? n + 1 : n - 1).at) : law[PIERCE_WALL];
   const double most = (pull < back ? pull : back) * (exp(law[PIERCE_CAPSTAN] * by.angle) - 1.0);
   const double share = cos(0.5 * by.angle);
-  return (share > HAIRPIN ? share : HAIRPIN) * (most + law[PIERCE_FRICTION] * length);
+  return (share > HAIRPIN ? share : HAIRPIN) * (most + law[PIERCE_FRICTION] * length_in(f, i, arc, s, n));
 }
 
 // Follows a thread that has slid through a hole: the place that holds it goes on along the thread by as much as its spring
@@ -356,7 +437,7 @@ PALPATE void follow_thread(const Fields& f, int i, const Arc& arc, double* s, in
   const Seat seat = seat_of_hole(f, s, n);
   const D3 p = seat.at;
   const double off = dot(by.at - p, by.along);
-  const double slack = thread_friction(f, i, by, seat, s, n) / f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
+  const double slack = thread_friction(f, i, arc, by, seat, s, n) / f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
   if (fabs(off) <= slack) return;
   place -= off > 0.0 ? off - slack : off + slack;
   const double whole = thread.length();
@@ -372,7 +453,7 @@ template <class Fields>
 PALPATE void tie_thread(const Fields& f, Thread t, int i, int n, const Arc& arc, double weight, double* s) {
   const Seat seat = seat_of_hole(f, s, n);
   const Passing by = passing(f, i, arc, hole(s, n)[HOLE_THREAD]);
-  const double most = thread_friction(f, i, by, seat, s, n);
+  const double most = thread_friction(f, i, arc, by, seat, s, n);
   const bool sticks = f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS] * fabs(dot(by.at - seat.at, by.along)) < most;
   const D3 force = load(f.pull.data + 3 * (POINTS * i + n));
   tie(f, t, POINTS * i + n, seat, by.at, force, across_and_along(weight, sticks ? weight : 0.0, by.along), false);
@@ -381,11 +462,12 @@ PALPATE void tie_thread(const Fields& f, Thread t, int i, int n, const Arc& arc,
 // Closes holes that the tip has been drawn out of, and lets go of those that the swage has left, or hands them to the
 // thread, those in the surface. It may come back, or end.
 template <class Fields>
-PALPATE void close_holes(const Fields& f, int i, const Arc& arc, double* s) {
+PALPATE void close_holes(const Fields& f, Thread t, int i, const Arc& arc, double* s) {
   const auto thread = strand_of(f, i);
   const bool stops = f.law.data[PIERCE_LENGTH * i + PIERCE_STOP] > 0.0;
   int count = (int)s[NEEDLE_COUNT], kept = 0;
   while (count > 0 && place_of_hole(f, arc, s, count - 1) > arc.length) --count;
+  s[NEEDLE_COUNT] = count;
   for (int h = 0; h < count; ++h) {
     double* from = hole(s, h);
     const double place = place_of_hole(f, arc, s, h);
@@ -399,6 +481,7 @@ PALPATE void close_holes(const Fields& f, int i, const Arc& arc, double* s) {
   s[NEEDLE_COUNT] = kept;
   for (int h = 0; h < kept; ++h)
     if (on_thread(s, h)) follow_thread(f, i, arc, s, h);
+  tear_holes(f, t, i, arc, s);
 }
 
 // Ties a needle to its holes and its tip to its seat. What has slipped, as the step begins, bears a constant force,
@@ -410,7 +493,6 @@ PALPATE void tie_needle(const Fields& f, Thread t, int i, const Arc& arc, const 
   const double h = f.mj.timestep.data[0], reach = f.ahead * h;
   const double k = law[PIERCE_STIFFNESS], weight = k * f.gain * h * h;
   const int count = (int)s[NEEDLE_COUNT], b = f.body.data[i];
-  double before = 0.0;  // the last hole's place
   int ties = 0;
   for (int n = 0; n < count; ++n) {
     if (on_thread(s, n)) {
@@ -420,15 +502,9 @@ PALPATE void tie_needle(const Fields& f, Thread t, int i, const Arc& arc, const 
     ++ties;
     const Seat seat = seat_of_hole(f, s, n);
     const double place = arc.nearest(seat.at);
-    // Half the way to each neighbour with tissue between; all of it to the tip.
-    const bool from = n > 0 && in_solid(kind_of(s, n - 1)), on = in_solid(kind_of(s, n));
-    const double next = n + 1 < count ? place_of_hole(f, arc, s, n + 1) : 2.0 * arc.length - place;
-    double length = kind_of(s, n) == THROUGH ? law[PIERCE_WALL] : 0.0;
-    length += (from ? 0.5 * fabs(place - before) : 0.0) + (on ? 0.5 * fabs(next - place) : 0.0);
-    before = place;
     const D3 along = arc.along(place), at = arc.place(place);
     const D3 rel = velocity_of(f, b, moving, at) - seat.vel;
-    const double most = law[PIERCE_FRICTION] * length;
+    const double most = law[PIERCE_FRICTION] * length_in(f, i, arc, s, n);
     double& slip = hole(s, n)[HOLE_SLIP];
     const double slack = most / k, off = slip - place;
     const bool slips = fabs(off) > slack;
@@ -490,7 +566,7 @@ PALPATE void aim_thread(const Fields& given, Thread t, int i) {
   double s[NEEDLE_LENGTH];
   for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
   const Arc arc = arc_of(f, i);
-  close_holes(f, i, arc, s);
+  close_holes(f, t, i, arc, s);
   lift_contacts(f, i, arc, s);
   all.first.data[0] = all.tie_count.data[0];
   for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
@@ -505,7 +581,8 @@ PALPATE void aim_thread(const Fields& given, Thread t, int i) {
     store(tie + TIE_AIM, add_turned({0.0, 0.0, 0.0}, all.frame.data, goes - load(all.origin.data)));
     tie[TIE_PART] = by.part;
     tie[TIE_STIFFNESS] = f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
-    tie[TIE_FRICTION] = thread_friction(f, i, by, seat, s, n);
+    tie[TIE_FRICTION] = thread_friction(f, i, arc, by, seat, s, n);
+    tie[TIE_BEARS] = bears_across(f, i, arc, s, n);
     store(tie + TIE_ALONG, add_turned({0.0, 0.0, 0.0}, all.frame.data, turned(f.own.frame.data, by.along)));
     all.tie_edge.data[at] = by.edge;
     all.tie_count.data[0] = at + 1;
@@ -519,13 +596,19 @@ PALPATE void feel_thread(const Fields& given, Thread t, int i) {
   const auto& f = all.pierced;
   double s[NEEDLE_LENGTH];
   for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
-  close_holes(f, i, arc_of(f, i), s);
+  close_holes(f, t, i, arc_of(f, i), s);
   int at = all.first.data[0];
   for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
     if (!on_thread(s, n)) continue;
     const D3 zero = {0.0, 0.0, 0.0};
-    const D3 force = at < MOST_TIES ? turned(all.frame.data, load(all.tie_value.data + TIE_LENGTH * at++ + TIE_FORCE)) : zero;
-    store(f.pull.data + 3 * (POINTS * i + n), add_turned(zero, f.own.frame.data, zero - force));
+    const double* tie = all.tie_value.data + TIE_LENGTH * at;
+    const bool felt = at < MOST_TIES;
+    const auto put = [&](double* into, D3 a) {
+      store(into + 3 * (POINTS * i + n), felt ? add_turned(zero, f.own.frame.data, turned(all.frame.data, a)) : zero);
+    };
+    put(f.pull.data, zero - load(tie + TIE_FORCE));
+    put(f.torn.data, load(tie + TIE_TORN));
+    at += felt;
   }
 }
 
@@ -539,12 +622,13 @@ PALPATE void enter_needles(const Fields& given, Thread t, int) {
     const Arc arc = arc_of(f, i);
     const int b = f.body.data[i];
     const Twist moving = twist(f.mj, b, false);
-    close_holes(f, i, arc, s);
+    close_holes(f, t, i, arc, s);
     if (s[NEEDLE_STAGE] == INSIDE && !goes_in(s)) s[NEEDLE_STAGE] = AWAY;
     if (s[NEEDLE_STAGE] == INSIDE) cut_way(f, t, i, arc, s);
     if (s[NEEDLE_STAGE] == AWAY) touch(f, t, i, arc, velocity_of(f, b, moving, arc.place(arc.length)), s);
     if (s[NEEDLE_STAGE] == TOUCHING) press(f, t, i, arc, s);
     tie_needle(f, t, i, arc, moving, s);
+    tear_by_thread(f, t, i, arc, s);
     if (t.tid > 0) continue;
     lift_contacts(f, i, arc, s);
     for (int c = 0; c < NEEDLE_LENGTH; ++c) f.next.data[NEEDLE_LENGTH * i + c] = s[c];
