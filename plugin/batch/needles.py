@@ -33,6 +33,7 @@ class Needles(NamedTuple):
     hole_rest: the same at rest [m]                                    (nworld, n, 20, 3)
     hole_along: where along the needle, see `Pinhole` [m]                 (nworld, n, 20)
     hole_force: on the organ in the last step [N]                      (nworld, n, 20, 3)
+    hole_torn: how far it has torn through the tissue [m]                 (nworld, n, 20)
   """
 
   touches: wp.array
@@ -47,6 +48,7 @@ class Needles(NamedTuple):
   hole_rest: wp.array
   hole_along: wp.array
   hole_force: wp.array
+  hole_torn: wp.array
 
 
 _OF_HOLES = [name for name in Needles._fields if name.startswith("hole_")]
@@ -69,6 +71,7 @@ class ToldNeedles:
   hole_rest: floats("nworld", "nneedle", HOLES, 3)
   hole_along: floats("nworld", "nneedle", HOLES)
   hole_force: floats("nworld", "nneedle", HOLES, 3)
+  hole_torn: floats("nworld", "nneedle", HOLES)
 
 
 @struct

@@ -378,7 +378,7 @@ class Needles(Force):
   def carry(self, world: int, group: np.ndarray, member: np.ndarray, share: np.ndarray):
     """See `Force`."""
     if self:
-      self._before[world] = self.host.mesh(world)
+      self._before.setdefault(world, self.host.mesh(world))
 
   def reshape(self, world: int):
     """See `Force`: holes stay where they are in the tissue, those that a cut went through open."""

@@ -43,7 +43,7 @@ def compare(organ, worlds, limit: float, which=slice(None)):
     assert (found[name] == getattr(needle, name)).all()
   np.testing.assert_allclose(found["energy"], needle.energy, rtol=1e-3, atol=1e-7)
   near = {name: (np.array([getattr(hole, name) for hole in needle.holes]), f"hole_{name}")
-          for name in ("inside", "thread", "along", "rest", "at", "force")}  # fmt: skip
+          for name in ("inside", "thread", "along", "rest", "at", "force", "torn")}  # fmt: skip
   near = {told: (found[told][:, :n], expected) for expected, told in near.values() if n}
   near["x"] = tissue.xpos.numpy()[which], organ.xpos
   for name in ("force", "tip_force"):
@@ -68,6 +68,22 @@ def test_a_needle_goes_through_a_sheet_and_back_as_under_the_plugin(device, free
   assert {(True, 0), (False, 1)} <= set(seen)
   assert not organ.pinholes
   assert not worlds.failures.numpy().any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_needle_tears_a_sheet_as_under_the_plugin(device):
+  """Levered sideways, it tears its hole as far, by the same force."""
+  model, data, organ, worlds = scene(device, **COARSE)
+  for _ in drive(model, data, worlds, [1.1]):
+    pass
+  for k in range(130):
+    data.ctrl[1] += 5e-5
+    mujoco.mj_step(model, data)
+    worlds.ctrl = np.tile(data.ctrl, (worlds.nworld, 1))
+    worlds.step()
+    if k % 10 == 9:
+      compare(organ, worlds, 0.02)
+  assert organ.pinholes[0].torn > 1e-3
 
 
 @SLOW

@@ -725,6 +725,7 @@ PALPATE void tell_needles(const Fields& all, Thread t, int) {
       told.hole_inside.data[at] = kind_of(s, n) == WITHIN;
       told.hole_thread.data[at] = on_thread(s, n);
       told.hole_along.data[at] = (float)(on_thread(s, n) ? -hole(s, n)[HOLE_THREAD] : arc.nearest(seat.at));
+      told.hole_torn.data[at] = (float)hole(s, n)[HOLE_TORN];
       store(told.hole_at.data + 3 * at, in_world(R, origin, seat.at));
       store(told.hole_rest.data + 3 * at, in_world(R, origin, rest));
       store(told.hole_force.data + 3 * at, turned(R, load(force + 3 * n)));
