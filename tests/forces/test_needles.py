@@ -45,6 +45,7 @@ def scene(
   tilt=1.3,
   nodes=0,
   suture=None,
+  tip="taper",
   follow=(),
   **config,
 ):
@@ -70,7 +71,7 @@ def scene(
     way = 1.5e-3 * np.arange(nodes)[:, None] * (-0.9, 0, 0.436)
     palpate.add_thread(spec, pos + swage + way, thread, strength=1e3, **(suture or {}))
   if free:
-    palpate.add_needle(spec, length=LENGTH, quat=quat, pos=pos, thread=thread)
+    palpate.add_needle(spec, length=LENGTH, quat=quat, pos=pos, thread=thread, tip=tip)
     data = np.zeros(mujoco.mjNEQDATA)
     data[6:11] = *quat, 1
     spec.add_equality(
@@ -78,7 +79,7 @@ def scene(
       name2="needle", solref=[0.004, 1], solimp=[0.999, 0.9999, 0.001, 0.5, 2], data=data,
     )  # fmt: skip
   else:
-    palpate.add_needle(spec, length=LENGTH, quat=quat, parent="hand", thread=thread)
+    palpate.add_needle(spec, length=LENGTH, quat=quat, parent="hand", thread=thread, tip=tip)
   for name in follow:  # and no longer the needle
     body = spec.worldbody.add_body(name=name, pos=(0.1, 0, 0))
     body.add_freejoint()
@@ -215,6 +216,33 @@ def test_friction_goes_by_length_in_tissue():
     turn = data.body("needle").xmat.reshape(3, 3)
     seen.append(hole.force @ turn @ (-np.sin(angle), np.cos(angle), 0))
   assert np.mean(seen[300:]) == pytest.approx(FRICTION * THICK, rel=0.02)
+
+
+def test_insertions_are_those_of_the_published_model():
+  """A constant force of cutting, and friction by length (Okamura et al. 2004).
+
+  Needles of several widths give the toughness, as of liver by Gokgol et al. 2012: 164 +- 6 J/m^2
+  (doi:10.1016/j.medengphy.2011.09.030). Curves that they measured were not at hand.
+  """
+  toughness, friction, cutting = 164.0, 15.0, {}
+  for tip, slit in (("taper", SLIT), ("cutting", 2 * SLIT)):
+    law = f"needle {toughness} {friction}"
+    model, data, organ = load(scene(solid=True, height=0.0175, needles=law, tip=tip))
+    rows = []
+    while len(organ.needles[0].holes) < 8:
+      data.ctrl[0] += 3e-3
+      mujoco.mj_step(model, data)
+      if organ.pinholes:  # what acts across the needle has no torque about its circle
+        length = LENGTH - organ.pinholes[0].along
+        rows.append((length, -data.qfrc_passive[0] / RADIUS))
+    depth, force = np.array(rows).T
+    inside = depth > 3e-3
+    slope, cutting[slit] = np.polyfit(depth[inside], force[inside], 1)
+    expected = toughness * slit + friction * depth[inside]
+    assert np.sqrt(np.mean((force[inside] - expected) ** 2)) < 0.01 * expected.mean()
+    assert slope == pytest.approx(friction, rel=0.01)
+  found = (cutting[2 * SLIT] - cutting[SLIT]) / SLIT
+  assert found == pytest.approx(toughness, abs=6)
 
 
 def test_two_sheets_are_sewn_through():
