@@ -229,18 +229,19 @@ def test_insertions_are_those_of_the_published_model():
     law = f"needle {toughness} {friction}"
     model, data, organ = load(scene(solid=True, height=0.0175, needles=law, tip=tip))
     rows = []
-    while len(organ.needles[0].holes) < 8:
-      data.ctrl[0] += 3e-3
+    for k in range(280):
+      data.ctrl[0] += 6e-3
       mujoco.mj_step(model, data)
-      if organ.pinholes:  # what acts across the needle has no torque about its circle
+      # What acts across the needle has no torque about its circle.
+      if k % 4 == 0 and organ.pinholes:
         length = LENGTH - organ.pinholes[0].along
         rows.append((length, -data.qfrc_passive[0] / RADIUS))
     depth, force = np.array(rows).T
     inside = depth > 3e-3
     slope, cutting[slit] = np.polyfit(depth[inside], force[inside], 1)
     expected = toughness * slit + friction * depth[inside]
-    assert np.sqrt(np.mean((force[inside] - expected) ** 2)) < 0.01 * expected.mean()
-    assert slope == pytest.approx(friction, rel=0.01)
+    assert np.sqrt(np.mean((force[inside] - expected) ** 2)) < 0.02 * expected.mean()
+    assert slope == pytest.approx(friction, rel=0.02)
   found = (cutting[2 * SLIT] - cutting[SLIT]) / SLIT
   assert found == pytest.approx(toughness, abs=6)
 
@@ -304,8 +305,8 @@ def test_a_thread_slides_through_a_hole_as_around_a_capstan():
   assert held == pytest.approx(np.exp(mu * angle), rel=0.03)
   assert palpate.Thread(model, data, "suture").error is None
   aside = np.array([0.0, 0.8, 0.6])
-  found = tears_at(model, data, organ, {0: aside, nodes - 1: aside * (1, 1, -1)}, 1.2)
-  assert found == pytest.approx(ENERGY * THICK, rel=0.03)
+  (hole,) = tears_at(model, data, organ, {0: aside, nodes - 1: aside * (1, 1, -1)}, 1.2)
+  assert np.linalg.norm(hole.force) == pytest.approx(ENERGY * THICK, rel=0.03)
 
 
 def test_a_needle_draws_its_thread_through_both_lips():
@@ -496,22 +497,22 @@ def test_a_needle_that_is_levered_sideways_tears_the_sheet():
 
 
 def tears_at(model, data, organ, ends, most):
-  """Pulls at nodes by rising forces [N]; returns the force of the pinhole at which it tears."""
-  start = organ.pinholes[0].torn
+  """Pulls at nodes by rising forces [N]; returns pinholes as they were before the first tore."""
+  before = organ.pinholes
   for _ in pull(model, data, ends, 0.0, most, 500):
-    if organ.pinholes[0].torn > start + 1e-5:
-      return np.linalg.norm(organ.pinholes[0].force)
-  return np.inf
+    if organ.pinholes[0].torn > before[0].torn + 1e-5:
+      return before
+    before = organ.pinholes
+  raise AssertionError("it has not torn")
 
 
 @pytest.mark.parametrize("windows", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_thread_follows_through_a_solid_and_tears_it(windows):
   """Of a bite each pinhole bears G by half the way to the other one."""
-  nodes, energy, room = 14, 40.0, {"nodes": 150} if windows else False
-  law = f"needle {energy} 0 60"
-  model, data, organ = load(
-    scene(solid=True, height=0.0175, nodes=nodes, needles=law, windows=room)
-  )
+  nodes, energy = 14, 40.0
+  law, room = f"needle {energy} 0 60", {"nodes": 150} if windows else False
+  given = {"height": 0.0175, "nodes": nodes, "windows": room}
+  model, data, organ = load(scene(solid=True, needles=law, **given))
   drive(model, data, organ, [5.8], speed=8.0)
   first, second = organ.pinholes
   assert first.thread
@@ -520,10 +521,10 @@ def test_a_thread_follows_through_a_solid_and_tears_it(windows):
   data.eq_active[:] = 0
   model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
   up = np.array([0.0, 0.0, 1.0])
-  found = tears_at(model, data, organ, {0: up, nodes - 1: up}, 0.6)
-  first, second = organ.pinholes
-  bite = np.linalg.norm(second.at - first.at)  # the tissue gives way by half
-  assert found == pytest.approx(energy * bite / 2, rel=0.05)  # friction along it adds 3 %
+  first, second = tears_at(model, data, organ, {0: up, nodes - 1: up}, 0.6)
+  bears = energy * np.linalg.norm(second.at - first.at) / 2
+  # Friction along the thread is part of the force, some 3 %.
+  assert np.linalg.norm(first.force) == pytest.approx(bears, rel=0.05)
 
 
 def test_a_pinhole_stays_where_it_is_beside_a_cut():
