@@ -299,7 +299,7 @@ class Needles(Force):
     host.load(_aim)
 
     def aim():
-      host.launch(_aim, held, arg=k)
+      host.launch(_aim, held, self.count, k)
       host.open_contacts()
 
     ties.aims[host.instance, k] = aim
@@ -313,7 +313,7 @@ class Needles(Force):
     """Takes the forces of the threads' steps, which these take first."""
     for k, held in self._held.items():
       self.host.ties(self._threads[k]["flex"]).lead(self.host.instance)
-      self.host.launch(_feel, held, arg=k)
+      self.host.launch(_feel, held, self.count, k)
 
   def sew(self, name: str, x: np.ndarray):
     """Makes holes where a needle's thread goes through the surface, of one world.

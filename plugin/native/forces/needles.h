@@ -348,7 +348,8 @@ PALPATE double length_in(const Fields& f, int i, const Arc& arc, double* s, int 
   const bool from = n > 0 && in_solid(kind_of(s, n - 1)), on = in_solid(kind);
   const double before = from ? place_of_hole(f, arc, s, n - 1) : 0.0;
   const double next = n + 1 < count ? place_of_hole(f, arc, s, n + 1) : 2.0 * arc.length - place;
-  return (kind == THROUGH ? wall : 0.0) + (from ? 0.5 * fabs(place - before) : 0.0) + (on ? 0.5 * fabs(next - place) : 0.0);
+  const double sides = (from ? 0.5 * fabs(place - before) : 0.0) + (on ? 0.5 * fabs(next - place) : 0.0);
+  return (kind == THROUGH ? wall : 0.0) + sides;
 }
 
 // What the tissue bears across a needle or a thread at a hole.
@@ -408,14 +409,16 @@ PALPATE void tear_by_thread(const Fields& f, Thread t, int i, const Arc& arc, do
   for (int n = (int)s[NEEDLE_COUNT] - 1; n >= 0; --n) {
     const D3 way = load(f.torn.data + 3 * (POINTS * i + n));
     const double far = norm(way), most = f.edge < far ? f.edge / far : 1.0;
-    if (on_thread(s, n) && far > 0.0 && !tear_by(f, t, s, n, most * way, bears_across(f, i, arc, s, n))) drop_hole(s, n);
+    if (!on_thread(s, n) || !(far > 0.0)) continue;
+    if (!tear_by(f, t, s, n, most * way, bears_across(f, i, arc, s, n))) drop_hole(s, n);
   }
 }
 
 // What friction of a thread in a hole bears along it, of the difference of the tensions on both sides of the edge that is
 // in it.
 template <class Fields>
-PALPATE double thread_friction(const Fields& f, int i, const Arc& arc, const Passing& by, const Seat& seat, double* s, int n) {
+PALPATE double thread_friction(const Fields& f, int i, const Arc& arc, const Passing& by, const Seat& seat, double* s,
+                               int n) {
   const double* law = f.law.data + PIERCE_LENGTH * i;
   const auto thread = strand_of(f, i);
   const int e = by.edge;
@@ -567,6 +570,7 @@ PALPATE void aim_thread(const Fields& given, Thread t, int i) {
   for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
   const Arc arc = arc_of(f, i);
   close_holes(f, t, i, arc, s);
+  if (t.tid > 0) return;
   lift_contacts(f, i, arc, s);
   all.first.data[0] = all.tie_count.data[0];
   for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
@@ -597,6 +601,7 @@ PALPATE void feel_thread(const Fields& given, Thread t, int i) {
   double s[NEEDLE_LENGTH];
   for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
   close_holes(f, t, i, arc_of(f, i), s);
+  if (t.tid > 0) return;
   int at = all.first.data[0];
   for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
     if (!on_thread(s, n)) continue;

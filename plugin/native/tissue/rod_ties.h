@@ -1,6 +1,6 @@
 // What a rod goes through: points that hold it, each tied to a place on an edge by a spring, which along the rod bears no
-// more than friction does, and across it no more than the point, which tears. The rod's step takes them to move on as they do; what holds it takes the force that comes of
-// that.
+// more than friction does, and across it no more than the point, which tears. The rod's step takes them to move on as they
+// do; what holds it takes the force that comes of that.
 #pragma once
 #include "tissue/rod_contact.h"
 
