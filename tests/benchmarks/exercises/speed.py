@@ -31,6 +31,7 @@ from palpate.tasks.recorder import Recorder
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
 MANY = {  # exercises in many worlds, and how many
   "touch/easy": 1024, "grasp/easy": 512, "cut/easy": 256, "retract/easy": 256, "bimanual/easy": 256,
+  "suture/drive_easy": 4096,
 }  # fmt: skip
 STEPS, TURNS = 100, 9  # control steps of a run, and stretches that are timed
 
