@@ -403,6 +403,18 @@ def test_a_running_stitch_holds_a_cut_closed():
     assert crossing(thread).sum() == pytest.approx(force, rel=0.01)
 
 
+def test_stitches_hold_an_organ_with_windows_alike():
+  """Holes are in the tissue, wherever the window is."""
+  seen = []
+  for windows in (False, {"tools": ["needle"]}):
+    line = seam(4, 5e-3, 6e-3, 5e-4)
+    model, data, organ, _ = wound(line, 0.012, tension=40.0, windows=windows)
+    mujoco.mj_step(model, data, 80)
+    seen.append([hole.at for hole in organ.pinholes])
+    assert organ.error is None
+  np.testing.assert_allclose(*seen, atol=2e-5)
+
+
 @pytest.mark.slow
 def test_stitches_close_a_cut_that_are_pulled_tight_one_after_the_other():
   """A surgeon's bites, 5 mm from the edge and 6 mm apart, in a wall under 40 N/m.
