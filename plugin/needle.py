@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 import mujoco
 import numpy as np
 
+from .engine.model import flexes
+
 ARCS = {"1/4": 0.25, "3/8": 0.375, "1/2": 0.5, "5/8": 0.625}  # of a circle
 # Width of the slit that a tip opens over the diameter: the edges of a cutting one are as wide, and
 # a cone tears a crack of about half (Shergold and Fleck 2004, doi:10.1098/rspa.2004.1315).
@@ -115,9 +117,8 @@ def add_needle(
 
 def _place(body, pos, quat, point: np.ndarray) -> np.ndarray:
   """Returns where a point of a body is in the world [m], given its place in its parent."""
-  turn = np.zeros(9)
-  mujoco.mju_quat2Mat(turn, np.asarray(quat, float) / np.linalg.norm(quat))
-  at = np.asarray(pos, float) + turn.reshape(3, 3) @ point
+  turn = flexes.matrix(np.asarray(quat, float) / np.linalg.norm(quat))
+  at = np.asarray(pos, float) + turn @ point
   return at if body.parent is None else _place(body.parent, body.pos, body.quat, at)
 
 

@@ -159,10 +159,9 @@ class Camera:
     Returns:
       values of fields of `View`, without their first axis
     """
-    mat, lamps, things = np.zeros(9), _lamps(m), self.scene.things
-    mujoco.mju_quat2Mat(mat, m.cam_quat[self._number])
+    lamps, things = _lamps(m), self.scene.things
     return dict(
-      cam_pos=m.cam_pos[self._number], cam_mat=mat.reshape(3, 3),
+      cam_pos=m.cam_pos[self._number], cam_mat=flexes.matrix(m.cam_quat[self._number]),
       fovy=np.radians(m.cam_fovy[self._number]),
       rgba=np.array([colour(m, *thing.where) for thing in things]),
       tex=np.array([texture(m, *t.where) if t.tex >= 0 else -1 for t in things], np.int32),

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 
 import mujoco
 import numpy as np
+from palpate.engine.model import flexes
 
 from . import shapes, textures
 from .shapes import Triangles
@@ -156,9 +157,7 @@ class Scene:
       except ValueError as error:
         raise ValueError(f"{_name(m, _OBJ.mjOBJ_GEOM, g)}: {error}") from None
     surface = self._coords(thing, surface, size, known, kind)
-    mat = np.zeros(9)
-    mujoco.mju_quat2Mat(mat, m.geom_quat[g])
-    surface = surface.moved(m.geom_pos[g], mat.reshape(3, 3))
+    surface = surface.moved(m.geom_pos[g], flexes.matrix(m.geom_quat[g]))
     body = int(m.geom_bodyid[g])
     if thing.rgba[3] < _OPAQUE:
       self.parts.append(Part(surface, np.full(len(surface.face), k), body, clear=True))
@@ -197,9 +196,7 @@ class Scene:
       )
     number = self.thing(_OBJ.mjOBJ_SKIN, k, int(m.skin_matid[k]))
     vert, face, texcoord = skin(m, k)
-    mat = np.zeros(9)
-    mujoco.mju_quat2Mat(mat, m.skin_bonebindquat[bone].astype(float))
-    vert = (vert - m.skin_bonebindpos[bone]) @ mat.reshape(3, 3)
+    vert = (vert - m.skin_bonebindpos[bone]) @ flexes.matrix(m.skin_bonebindquat[bone])
     if m.skin_inflate[k]:
       raise ValueError(f"{_name(m, _OBJ.mjOBJ_SKIN, k)} is inflated, expected inflate 0")
     if texcoord is not None:
@@ -215,13 +212,11 @@ class Scene:
     k = self.thing(_OBJ.mjOBJ_SITE, s, int(m.site_matid[s]))
     kind, size, full = int(m.site_type[s]), m.site_size[s], site_size(m, s)
     unit = size / full
-    mat = np.zeros(9)
-    mujoco.mju_quat2Mat(mat, m.site_quat[s])
     surface = shapes.primitive(m, kind, unit)
     self.parts.append(
       Part(
         self._coords(self.things[k], surface, unit, True, kind), np.full(len(surface.face), k),
-        int(m.site_bodyid[s]), m.site_pos[s].copy(), mat.reshape(3, 3), full, True, s,
+        int(m.site_bodyid[s]), m.site_pos[s].copy(), flexes.matrix(m.site_quat[s]), full, True, s,
       )
     )  # fmt: skip
 

@@ -110,7 +110,7 @@ def body_frame(m, body: int) -> tuple[np.ndarray, np.ndarray]:
 def matrix(quat: np.ndarray) -> np.ndarray:
   """Returns the rotation of a quaternion, (3, 3)."""
   out = np.zeros(9)
-  mujoco.mju_quat2Mat(out, quat.copy())
+  mujoco.mju_quat2Mat(out, np.array(quat, float))
   return out.reshape(3, 3)
 
 

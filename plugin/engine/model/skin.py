@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry import subdivide
@@ -124,9 +123,8 @@ def draw(w: Workspace, model: int, data: int):
   body = int(mjstruct.view(m.skin_bonebodyid, m.nskinbone, np.int32)[skin.bone])
   pos = mjstruct.view(d.xpos, (m.nbody, 3))[body]
   mat = mjstruct.view(d.xmat, (m.nbody, 9))[body].reshape(3, 3)
-  bind, turn = np.zeros(9), mjstruct.view(m.skin_bonebindquat, (m.nskinbone, 4), np.float32)
-  mujoco.mju_quat2Mat(bind, turn[skin.bone].astype(float))
-  bound = (fine - pos) @ mat @ bind.reshape(3, 3).T
+  turn = mjstruct.view(m.skin_bonebindquat, (m.nskinbone, 4), np.float32)[skin.bone]
+  bound = (fine - pos) @ mat @ flexes.matrix(turn).T
   bound += mjstruct.view(m.skin_bonebindpos, (m.nskinbone, 3), np.float32)[skin.bone]
   out = mjstruct.view(m.skin_vert, (m.nskinvert, 3), np.float32)
   out[skin.adr : skin.adr + len(fine)] = bound
