@@ -18,6 +18,8 @@ TIPS = {"taper": 0.5, "cutting": 1.0}
 _STEEL = 7800.0  # density [kg/m^3]
 _CAPSULES = 16  # of the arc
 _POINT = (0.7, 0.35)  # radius of the last two over that of the others
+_RINGS, _SIDES = 49, 12  # of the surface that is drawn
+_HIDDEN = 3  # group of the capsules
 _NEAR = 1e-4  # from the swage to the first node of a thread [m]
 # What joins a thread: MuJoCo's equalities are as firm as what they hold is heavy, unless their
 # impedance is near to 1.
@@ -42,6 +44,8 @@ def add_needle(
   contact: Mapping[str, object] | None = None,
 ) -> mujoco.MjsBody:
   """Adds a surgical needle to a spec: a rigid body of capsules along an arc, in plain MJCF.
+
+  Pictures show a smooth surface, the geom `<name>`, in place of the capsules.
 
   The body's origin is the centre of the circle and its z axis that of the circle, so a turn about z
   drives the needle along itself, tip first. The middle of the arc is on the x axis. The sites
@@ -101,11 +105,13 @@ def add_needle(
     meets = {"contype": 0, "conaffinity": 0} if thread is not None and k == 0 else {}
     body.add_geom(
       name=f"{name}_{k}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends,
-      size=[radius, 0, 0], mass=mass / _CAPSULES, rgba=rgba, **(look | meets),
+      size=[radius, 0, 0], mass=mass / _CAPSULES, group=_HIDDEN, rgba=rgba, **(look | meets),
     )  # fmt: skip
+  _draw(spec, body, circle, angle, 0.5 * diameter, rgba)
   for end, k, half in (("swage", 0, diameter / 2), ("tip", -1, TIPS[tip] * diameter / 2)):
     along = (-np.sin(angle[k]), np.cos(angle[k]), 0.0)
-    body.add_site(name=f"{name}_{end}", pos=points[k], size=[half, half, half], zaxis=along)
+    size = [half, half, half]
+    body.add_site(name=f"{name}_{end}", pos=points[k], size=size, zaxis=along, group=4)
   if thread is not None:
     data = [*points[0], *np.zeros(mujoco.mjNEQDATA - 3)]
     spec.add_equality(
@@ -113,6 +119,42 @@ def add_needle(
       name1=name, name2=f"{thread}_0", data=data, **_FIRM,
     )  # fmt: skip
   return body
+
+
+def _draw(spec, body, circle: float, angle: np.ndarray, radius: float, rgba) -> None:
+  """Adds the surface that is drawn: steel, round, with a point over the last two capsules."""
+  along = np.linspace(0.0, 1.0, _RINGS)
+  thick = radius * np.clip(0.5 * _CAPSULES * (1 - along), 0.08, 1.0)
+  thick[0] *= 0.8  # a blunt edge at the swage
+  around = 2 * np.pi * np.arange(_SIDES) / _SIDES
+  turn = np.interp(along, np.linspace(0.0, 1.0, len(angle)), angle)[:, None]
+  out = circle + thick[:, None] * np.cos(around)
+  rings = np.stack(
+    [out * np.cos(turn), out * np.sin(turn), thick[:, None] * np.sin(around) + 0 * turn], axis=2
+  )
+  ends = circle * np.column_stack([np.cos(turn[[0, -1]]), np.sin(turn[[0, -1]]), [0, 0]])
+  k = np.arange(_SIDES)
+  here, beside = k, (k + 1) % _SIDES
+  first = _SIDES * np.arange(_RINGS - 1)[:, None]
+  walls = [
+    np.stack([first + here, first + _SIDES + here, first + beside], axis=2),
+    np.stack([first + beside, first + _SIDES + here, first + _SIDES + beside], axis=2),
+  ]
+  last, count = _SIDES * (_RINGS - 1), _SIDES * _RINGS
+  caps = [
+    np.column_stack([here, beside, np.full(_SIDES, count)]),
+    np.column_stack([last + beside, last + here, np.full(_SIDES, count + 1)]),
+  ]
+  faces = np.concatenate([*(wall.reshape(-1, 3) for wall in walls), *caps])
+  spec.add_mesh(
+    name=body.name, uservert=np.concatenate([rings.reshape(-1, 3), ends]).ravel(),
+    userface=faces.ravel(),
+  )  # fmt: skip
+  spec.add_material(name=body.name, rgba=rgba, specular=0.9, shininess=0.8)
+  body.add_geom(
+    name=body.name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=body.name, material=body.name,
+    contype=0, conaffinity=0, mass=0, group=2,
+  )  # fmt: skip
 
 
 def _place(body, pos, quat, point: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
+import trimesh
 
 LENGTH, DIAMETER = 0.026, 7e-4
 
@@ -37,6 +38,23 @@ def test_its_arc_is_a_part_of_a_circle(arc, share):
   assert model.body("needle").ipos == pytest.approx([middle, 0, 0], abs=0.01 * middle)
   assert model.body("needle").mass[0] == pytest.approx(7800 * np.pi / 4 * DIAMETER**2 * LENGTH)
   assert model.site("needle_tip").size[0] == pytest.approx(DIAMETER / 2)
+
+
+def test_its_picture_is_a_smooth_surface_around_its_capsules():
+  spec = mujoco.MjSpec()
+  palpate.add_needle(spec, "needle", length=LENGTH, diameter=DIAMETER)
+  model, data = load(spec)
+  drawn = [model.geom(g).name for g in range(model.ngeom) if model.geom_group[g] < 3]
+  assert drawn == ["needle"] and not model.geom("needle").contype[0]
+  turn = data.geom("needle").xmat.reshape(3, 3)
+  x = model.mesh_vert @ turn.T + data.geom("needle").xpos
+  surface = trimesh.Trimesh(x, model.mesh_face, process=False)
+  assert surface.is_watertight and surface.volume > 0
+  far = np.hypot(np.hypot(x[:, 0], x[:, 1]) - LENGTH / np.pi, x[:, 2])  # from the wire's middle
+  around = np.degrees(np.arctan2(x[:, 1], x[:, 0]))
+  wire = (np.abs(around) < 60) & (far > 0)
+  assert far[wire] == pytest.approx(DIAMETER / 2, rel=1e-3)
+  assert far[around > 89].max() < 0.1 * DIAMETER  # a point
 
 
 def test_its_thread_hangs_on_the_swage():

@@ -80,6 +80,7 @@ from .needles import (
 
 TAKEN = 25.0 / 180.0  # where it is to be taken, from its first end, as a share of it
 TUBE, SIDES = 0.0008, 12  # of a ring: radius of its wire [m], and straight pieces
+_FINE, _HIDDEN = 32, 3  # of a ring: sides in pictures, and the group of its pieces
 MASS = 7e-5  # of a needle of steel [kg]
 # Contacts of a needle of 0.07 g with a ring: about 3 N/mm, with the usual ones it would go through.
 FIRM = {"solref": (0.005, 1.0), "solimp": (0.999, 0.999, 1e-3, 0.5, 2.0), "solmix": 1e3}
@@ -262,12 +263,19 @@ class Transfer(Needlework):
     corners = far * np.column_stack([0 * turn, np.sin(turn), -np.cos(turn)])
     foot = corners[0] - np.array([0.0, 0.0, 0.02])
     look = {"contype": MEETS, "conaffinity": MEETS, "rgba": (0.2, 0.55, 0.6, 1.0)} | FIRM
+    round_ = spec.add_mesh(name="ring", scale=[self.size + TUBE] * 3)
+    round_.make_supertorus(_FINE, TUBE / (self.size + TUBE), 1.0, 1.0)
     for k in range(self.targets):
       ring = stands.add_body(name=f"ring{k}")
-      for start, end in (*itertools.pairwise(corners), (corners[0], foot)):
+      for i, (start, end) in enumerate([*itertools.pairwise(corners), (corners[0], foot)]):
         ring.add_geom(
-          type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[*start, *end], size=[TUBE, 0, 0], **look
-        )
+          type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[*start, *end], size=[TUBE, 0, 0],
+          group=_HIDDEN * (i < SIDES), **look,
+        )  # fmt: skip
+      ring.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_MESH, meshname="ring", quat=(1, 0, 1, 0), rgba=look["rgba"],
+        contype=0, conaffinity=0, mass=0, group=2,
+      )  # fmt: skip
     spec.add_sensor(
       name="scrape", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_XBODY,
       objname="rings", intprm=[2, 3, 1],
