@@ -243,6 +243,32 @@ def test_a_line_lies_on_the_tissue_and_is_followed(pages):
   page.close()
 
 
+# A thread around a quarter of a circle, whose last edge has broken.
+TUBE = """async () => {
+  const {Thread} = await import("/thread.js"), three = await import("/three/three.module.min.js");
+  const thread = new Thread(new three.Scene(), 7, 1e-4, null);
+  const turn = k => [0.01 * Math.cos(Math.PI * k / 12), 0.01 * Math.sin(Math.PI * k / 12)];
+  thread.drape(Array.from({length: 7}, (_, k) => [...turn(k), 0, k === 5 ? 0 : 1]).flat());
+  const {position, normal} = thread.geometry.attributes;
+  return [[...position.array], [...normal.array], [...thread.geometry.index.array]];
+}"""
+
+
+def test_a_thread_is_a_round_tube_through_its_nodes(pages):
+  page = pages.page.context.browser.new_page()
+  page.goto(f"{pages.server.url}card.js")
+  x, normal, faces = (np.reshape(each, (-1, 3)) for each in page.evaluate(TUBE))
+  around = np.degrees(np.arctan2(x[:, 1], x[:, 0]))
+  far = np.hypot(np.hypot(x[:, 0], x[:, 1]) - 0.01, x[:, 2])  # from the circle
+  whole = (around > 14) & (around < 61)
+  assert far[whole] == pytest.approx(1e-4, rel=0.05)
+  assert np.abs(x[(around > 76) & (around < 89), 2]).max() < 1e-9  # nothing is where it has broken
+  corners = x[faces[whole[faces].all(axis=1)]]
+  out = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+  assert (out * normal[faces[whole[faces].all(axis=1), 0]]).sum(axis=1).min() > 0  # faces outward
+  page.close()
+
+
 @pytest.mark.slow
 def test_too_much_force_and_a_lost_tip_are_seen_and_heard(pages):
   """Each in a colour and with a tone of its own, and noted in the recording."""

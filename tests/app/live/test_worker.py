@@ -16,6 +16,7 @@ import palpate
 import pytest
 from palpate import models
 from palpate.app.live import practice
+from palpate.app.live.coupling import Link
 from palpate.app.live.devices.hand import Hand
 from palpate.app.live.page.picture import HEAD, Camera
 from palpate.app.live.page.worker import Worker
@@ -318,6 +319,32 @@ def test_a_cut_is_told_with_its_edges():
   along = np.linalg.norm(end - start, axis=1)
   assert along.sum() / 2 == pytest.approx(0.02, abs=0.005)  # both edges of the cut, as long as it
   assert np.abs(start[:, 1]).max() < 0.003 < np.abs(other[:, 1]).max()
+
+
+def test_a_frame_has_the_places_of_a_thread():
+  spec = palpate.models.load("kidney", nodes=250)
+  line = np.array([0.1, 0, 0]) + 0.002 * np.arange(6)[:, None] * (0, 1, 0)
+  palpate.add_thread(spec, line, "suture", strength=0.5)
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  mujoco.mj_forward(model, data)
+  organ, thread = palpate.Organ(model, data, "kidney/kidney"), palpate.Thread(model, data, "suture")
+  camera, device = Camera(model, data, organ, "probe/"), Hand()
+  (told,) = camera.shapes()["threads"]
+  assert told["nodes"] == 6 and 5e-5 < told["radius"] < 2e-4
+
+  def nodes():
+    first = len(HEAD) + 3 * organ.nvert
+    frame = np.frombuffer(camera.frame(Link(device), Pace.instant()), np.float32)
+    return frame[first : first + 4 * 6].reshape(6, 4)
+
+  np.testing.assert_allclose(nodes(), np.column_stack([line, np.ones(6)]), atol=1e-6)
+  for k, pull in ((0, -1.0), (5, 1.0)):
+    data.xfrc_applied[model.body(f"suture_{k}").id, 1] = pull  # twice what it bears
+  for _ in range(50):
+    mujoco.mj_step(model, data)
+  assert thread.broken.any()
+  np.testing.assert_array_equal(nodes()[:-1, 3] == 0, thread.broken)
 
 
 def unpack(packed):

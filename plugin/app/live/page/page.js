@@ -6,7 +6,7 @@ import {Plot} from "./plots.js";
 import {speaker} from "./sounds.js";
 import {language, speak, t} from "./texts.js";
 import {PRACTICE, Tutorial} from "./tutorial.js";
-import {View} from "./view.js";
+import {parts, View} from "./view.js";
 
 const $ = id => document.getElementById(id);
 const STATES = ["waiting", "ready", "clutch", "lost", "paused"];
@@ -280,7 +280,7 @@ function start() {
 
 function take(numbers) {
   if (!scene) return;
-  const from = scene.head.length, nodes = numbers.subarray(from, numbers.length - 12 * scene.bodies - 19 * scene.sites.length);
+  const [nodes] = parts(scene, numbers);
   head = Object.fromEntries(scene.head.map((name, i) => [name, numbers[i]]));
   const now = performance.now();
   [last, frame, span, arrived] = [frame, numbers, Math.min(now - arrived, LONGEST), now];
@@ -351,8 +351,8 @@ function report(steps, punctual, share) {
 
 function targets() {
   if (!scene || !frame) return [];
-  const from = frame.length - 19 * scene.sites.length;
-  return Array.from({length: scene.targets}, (_, i) => [...frame.subarray(from + 19 * i, from + 19 * i + 8)]);
+  const sites = parts(scene, frame).at(-1), each = sites.length / scene.sites.length;
+  return Array.from({length: scene.targets}, (_, i) => [...sites.subarray(each * i, each * i + 8)]);
 }
 
 function draw() {

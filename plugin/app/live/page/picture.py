@@ -13,8 +13,9 @@ from typing import Any
 import mujoco as mj
 import numpy as np
 import trimesh
-from palpate import Organ
+from palpate import Organ, Thread
 from palpate.models.situs import LIGHT
+from palpate.organ import instances
 from palpate.tissue.geometry import subdivide
 from scipy.sparse import csr_array, vstack
 
@@ -68,6 +69,7 @@ class Camera:
     self._hooks = [s for s in range(model.nsite) if model.site(s).name.endswith(f"{HOOK}tip")]
     self._sensors = [self._sensor(prefix + name) for name in _SENSORS]
     self._burnt = [self._sensor(f"{model.site(s).name}_force") for s in self._hooks]
+    self._threads = [Thread(model, data, name) for name in instances(model, dim=1)]
     self._whole, self.peak, self._begun = organ.elem, 0.0, 0.0
     self._since = self._felt = None  # largest force since the last frame, and before [N]
     self._follow()
@@ -103,6 +105,7 @@ class Camera:
         }
         for (body, key), geoms in self._parts.items()
       ],
+      "threads": [self._thread(thread) for thread in self._threads],
       "bodies": len(self._bodies),
       "scenery": [
         _skin(model, data, s) for s in range(model.nskin)
@@ -128,6 +131,13 @@ class Camera:
       "head": HEAD,
       **more,
     }  # fmt: skip
+
+  def _thread(self, thread: Thread) -> dict[str, Any]:
+    """Returns a thread: how many nodes it has, its radius [m], its look."""
+    model, flex = self.model, mj.mj_name2id(self.model, mj.mjtObj.mjOBJ_FLEX, thread.name)
+    look = _look(model, int(np.ravel(model.flex_matid[flex])[0]), tuple(model.flex_rgba[flex]))
+    radius = float(np.ravel(model.flex_radius[flex])[0])
+    return {"nodes": len(thread.positions), "radius": radius, "look": look}
 
   def _used(self) -> set[int]:
     """Returns the materials of skins and of the organ."""
@@ -212,9 +222,10 @@ class Camera:
     self._since = self._felt = max(self._since or 0.0, force)
 
   def frame(self, link: Link, pace: Pace, progress: float = 0.0, powered: bool = False) -> bytes:
-    """Returns a frame, float32: `HEAD`, nodes, bodies (place, matrix), sites.
+    """Returns a frame, float32: `HEAD`, nodes, threads, bodies (place, matrix), sites.
 
-    A site has 19 numbers: place, colour, size, matrix.
+    A node of a thread has 4 numbers: place, and 1 where what follows it is whole, else 0. A site
+    has 19: place, colour, size, matrix.
     """
     data, model, late = self._data, self.model, pace.lateness
     tip, shaft, pos, quat = self._sensors
@@ -234,6 +245,7 @@ class Camera:
     parts = (
       head,
       (self._rest + self._organ.displacement[: len(self._rest)]).ravel(),
+      *(np.column_stack([t.positions, np.r_[~t.broken, True]]).ravel() for t in self._threads),
       np.hstack([data.xpos[bodies], data.xmat[bodies]]).ravel(),
       np.hstack([
         data.site_xpos[sites], model.site_rgba[sites], model.site_size[sites], data.site_xmat[sites]

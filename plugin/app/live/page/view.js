@@ -3,9 +3,9 @@
 import * as THREE from "./three/three.module.min.js";
 import {Blood} from "./blood.js";
 import {Line} from "./line.js";
-import {unpack} from "./numbers.js";
+import {Thread} from "./thread.js";
 
-const BODY = 12, SITE = 19;  // numbers of each in a frame
+const NODE = 4, BODY = 12, SITE = 19;  // numbers of a thread's node, a body and a site in a frame
 const LIP = 8e-4;  // width of the edge of a cut [m]
 const BESIDE = 0.006;  // from the lens to its lamp [m]
 const EXPERT = 0x59f2bf;
@@ -17,6 +17,14 @@ THREE.ShaderChunk.lights_pars_begin = THREE.ShaderChunk.lights_pars_begin.replac
   /(float getDistanceAttenuation\([^{]*\{)[\s\S]*?\n}/,
   "$1\n\treturn 1.0 / (cutoffDistance + decayExponent * lightDistance * lightDistance);\n}",
 );
+
+// Returns the parts of a frame: the organ's nodes, threads' nodes, bodies and sites.
+export function parts({head, threads, bodies, sites}, frame) {
+  const strands = threads.reduce((sum, {nodes}) => sum + NODE * nodes, 0);
+  const sizes = [strands, BODY * bodies, SITE * sites.length], free = frame.length - sizes.reduce((a, b) => a + b, head.length);
+  let at = head.length;
+  return [free, ...sizes].map(size => frame.subarray(at, at += size));
+}
 
 export class View {
   // Throws where the browser has no WebGL 2. `wet` asks for the full picture from a processor too.
@@ -94,6 +102,7 @@ export class View {
       return mesh;
     });
     this.world.add(...this.parts, ...this.marks);
+    this.threads = scene.threads.map(({nodes, radius, look}) => new Thread(this.world, nodes, radius, this.surface(look, true)));
     this.blood = new Blood(this.world, this.wet);
     this.line = new Line(this.world);
     this.weave(scene.organ);
@@ -205,6 +214,7 @@ export class View {
   // Draws a frame: its numbers, and those at its head by name.
   draw(frame, head, expert) {
     const {scene, canvas, camera} = this, width = canvas.clientWidth, height = canvas.clientHeight;
+    let from = 0;
     this.gl.setPixelRatio(this.fine);
     this.gl.setSize(width, height, false);
     this.follow(frame);
@@ -214,16 +224,17 @@ export class View {
     camera.updateProjectionMatrix();
     camera.matrix.makeBasis(...axes.map(axis => new THREE.Vector3(...axis))).setPosition(...at);
     camera.matrixWorldNeedsUpdate = true;
-    const places = frame.length - BODY * scene.bodies - SITE * scene.sites.length, sites = places + BODY * scene.bodies;
-    this.drape(frame.subarray(scene.head.length, places));
-    this.darken(frame, places);
+    const [nodes, threads, bodies, sites] = parts(scene, frame);
+    this.drape(nodes);
+    for (const thread of this.threads) thread.drape(threads.subarray(from, from += NODE * thread.nodes));
+    this.darken(bodies);
     for (const part of this.parts) {
-      pose(part.matrix, frame.subarray(places + BODY * part.userData.body));
+      pose(part.matrix, bodies.subarray(BODY * part.userData.body));
       part.matrixWorldNeedsUpdate = true;
     }
-    this.marks.forEach((mark, i) => place(mark, frame.subarray(sites + SITE * i, sites + SITE * (i + 1))));
+    this.marks.forEach((mark, i) => place(mark, sites.subarray(SITE * i, SITE * (i + 1))));
     this.show(expert, head);
-    this.fume(head.current > 0, frame, places);
+    this.fume(head.current > 0, bodies);
     this.stain();
     this.line.drape(this.nodes);
     this.gl.render(this.world, camera);
@@ -273,9 +284,9 @@ export class View {
   }
 
   // Where instruments are close to tissue, that is darker: their tips, and the shafts above them.
-  darken(frame, places) {
+  darken(bodies) {
     this.scene.tips.slice(0, SHADES).forEach(([body, ...at], i) => {
-      const from = pose(new THREE.Matrix4(), frame.subarray(places + BODY * body)), [tip, end] = this.shades.value.slice(2 * i);
+      const from = pose(new THREE.Matrix4(), bodies.subarray(BODY * body)), [tip, end] = this.shades.value.slice(2 * i);
       tip.set(...at).applyMatrix4(from);
       end.set(at[0], at[1], at[2] + LONG).applyMatrix4(from);
     });
@@ -307,12 +318,12 @@ export class View {
   }
 
   // Smoke rises from where a hook's current acts.
-  fume(burns, frame, places) {
+  fume(burns, bodies) {
     const now = performance.now() / 1e3, {smoke, scene} = this;
     this.blown = burns && scene.hooks.length ? Math.max(this.blown, now - LASTS) : now;
     if (this.blown < now) {
       const [body, ...tip] = scene.hooks[0];
-      const at = new THREE.Vector3(...tip).applyMatrix4(pose(new THREE.Matrix4(), frame.subarray(places + BODY * body)));
+      const at = new THREE.Vector3(...tip).applyMatrix4(pose(new THREE.Matrix4(), bodies.subarray(BODY * body)));
       this.blood.burn(at, this.nodes);
       for (; now - this.blown > LASTS / PUFFS; this.blown += LASTS / PUFFS) {  // several, where pictures are far apart
         const puff = smoke[this.puffed++ % PUFFS], away = () => 0.004 * (Math.random() - 0.5);
@@ -364,6 +375,13 @@ function drawnByProcessor() {
   const name = about ? gl.getParameter(about.UNMASKED_RENDERER_WEBGL) : "";
   gl.getExtension("WEBGL_lose_context")?.loseContext();
   return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}
+
+// Arrays as the server packs them, see `pack` in picture.py.
+const KINDS = {f: Float32Array, b: Uint8Array, h: Uint16Array, u: Uint32Array};
+function unpack(packed) {
+  const [[kind, text]] = Object.entries(packed), bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
+  return new KINDS[kind](bytes.buffer);
 }
 
 const add = (a, b) => a.map((x, i) => x + b[i]);
