@@ -1,5 +1,6 @@
 // A line that somebody draws on the organ with the pointer, to follow or to cut along: it goes with the tissue.
 import * as THREE from "./three/three.module.min.js";
+import {cross, dot} from "./vectors.js";
 
 const MOST = 600, STEP = 0.0012, DOT = 7e-4;  // dots; between two, and of one [m]
 const NEAR = 0.003, TOUCH = 0.02;  // of the tip that follows it [m], [N]
@@ -64,6 +65,4 @@ export class Line {
   }
 }
 
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const place = ({nodes, share}, x) => [0, 1, 2].map(k => share.reduce((sum, s, i) => sum + s * x[3 * nodes[i] + k], 0));

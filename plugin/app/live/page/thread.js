@@ -1,5 +1,6 @@
 // A thread as a tube, round and smooth through its nodes.
 import * as THREE from "./three/three.module.min.js";
+import {cross, dot, scale, sub, unit} from "./vectors.js";
 
 const SIDES = 8, PIECES = 4;  // around, and from node to node
 
@@ -37,8 +38,7 @@ export class Thread {
         way[j] = u + s * (2 * v + s * 3 * w);
       }
       way.splice(0, 3, ...unit(way));
-      const along = dot(up, way);
-      up = unit(up.map((x, j) => x - along * way[j]));
+      up = unit(sub(up, scale(way, dot(up, way))));
       const side = cross(way, up), ends = ring === 0 || ring === pieces + 2 || (s > 0 && s < 1 && !n[b + 3]);
       for (let i = 0; i < SIDES; i++) {
         const x = Math.cos(2 * Math.PI * i / SIDES), y = Math.sin(2 * Math.PI * i / SIDES), to = 3 * (SIDES * ring + i);
@@ -52,7 +52,3 @@ export class Thread {
     position.needsUpdate = normal.needsUpdate = true;
   }
 }
-
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const unit = a => a.map(x => x / Math.max(Math.hypot(...a), 1e-12));

@@ -4,6 +4,7 @@ import * as THREE from "./three/three.module.min.js";
 import {Blood} from "./blood.js";
 import {Line} from "./line.js";
 import {Thread} from "./thread.js";
+import {add, cross, dot, scale, sub, unit} from "./vectors.js";
 
 const NODE = 4, BODY = 12, SITE = 19;  // numbers of a thread's node, a body and a site in a frame
 const LIP = 8e-4;  // width of the edge of a cut [m]
@@ -384,11 +385,6 @@ function unpack(packed) {
   return new KINDS[kind](bytes.buffer);
 }
 
-const add = (a, b) => a.map((x, i) => x + b[i]);
-const sub = (a, b) => a.map((x, i) => x - b[i]);
-const scale = (a, s) => a.map(x => x * s);
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-
 // What marks are drawn as, of unit size.
 const FORMS = {ball: new THREE.SphereGeometry(1, 20, 14), box: new THREE.BoxGeometry(2, 2, 2)};
 FORMS.ellipsoid = FORMS.ball;
@@ -446,9 +442,7 @@ function creased(geometry) {
   const face = new Float32Array(3 * n);
   for (let i = 0; i < n; i++) {
     const [u, v] = [1, 2].map(k => [0, 1, 2].map(j => array[9 * i + 3 * k + j] - array[9 * i + j]));
-    const out = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
-    const size = Math.hypot(...out) || 1;
-    for (let j = 0; j < 3; j++) face[3 * i + j] = out[j] / size;
+    face.set(unit(cross(u, v)), 3 * i);
     for (let k = 0; k < 3; k++) {
       const key = [0, 1, 2].map(j => Math.round(1e6 * array[9 * i + 3 * k + j])).join();
       if (!near.has(key)) near.set(key, []);
