@@ -14,6 +14,7 @@ const PINCH = 3e-4;  // of two fingers [m]
 const ROLL = 0.01;  // [rad]
 const MOST = 0.04;  // in a message [m]
 const DEAD = 0.1;
+const MOVES = "onpointerrawupdate" in window ? "pointerrawupdate" : "pointermove";  // the latter waits for a picture
 const TILTS = 0.2;  // of the camera, half turns a second
 export const CLOCK = 1e6;  // in which the clock of messages goes round [ms]
 
@@ -33,7 +34,7 @@ export class Hand {
     this.turns = false;  // whether the instrument itself is one, whose camera turns
     this.begin();
     canvas.addEventListener("pointerdown", event => this.press(canvas, event));
-    canvas.addEventListener("pointermove", event => this.drag(event));
+    canvas.addEventListener(MOVES, event => this.drag(event));
     for (const kind of ["pointerup", "pointercancel"]) {
       canvas.addEventListener(kind, event => {
         this.fingers.delete(event.pointerId);

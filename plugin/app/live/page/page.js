@@ -16,6 +16,7 @@ const WORDS = 100;  // between numbers in words, which are laid out anew [ms]
 const ENOUGH = 40, PROMPT = 0.9;  // frames to judge by whether most of them are drawn
 const LONGEST = 100;  // that a picture lies behind what came [ms]
 const KEPT = 5000;  // of the times from hand to picture
+const TELL = 8;  // between looks at the hand [ms]; pictures may be further apart
 
 const asked = new URLSearchParams(location.hash.slice(1));
 speak();
@@ -30,7 +31,7 @@ let offer = null;  // of the program: exercises, devices, ...
 let tutorial = null;
 let scene = null, frame = null, head = {}, rest = null, running = false, paused = false;
 let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble = "", warned = "", late = null;
-let last = null, arrived = 0, span = 0, mixed = null;  // frames between which pictures lie [ms]
+let last = null, arrived = 0, span = 0, mixed = null, pictured = 0;  // frames between which pictures lie [ms]
 let waited = false;  // for a movement
 let turn = 0, told = 0, came = 0, shown = 0;
 const plots = {force: new Plot("force"), way: new Plot("way"), rate: new Plot("rate")};
@@ -357,13 +358,15 @@ function targets() {
 
 function draw() {
   requestAnimationFrame(draw);
-  if (running) hand.say().forEach(say);
   if (!frame) return;
-  const expert = trace && $("ghost").getAttribute("aria-pressed") === "true" ? trace : null, state = view.state();
-  const now = performance.now(), share = last?.length === frame.length ? Math.min((now - arrived) / Math.max(span, 1), 1) : 1;
+  const expert = trace && on("ghost") ? trace : null, state = view.state(), now = performance.now();
+  // A picture lies between frames where it comes as often as they do.
+  const often = last?.length === frame.length && now - pictured < 1.5 * span;
+  const share = often ? Math.min((now - arrived) / Math.max(span, 1), 1) : 1;
   if (!fresh && !expert && state === drawn) return;
   drawn = share < 1 ? "" : state;  // until the picture is where the frame is
   view.draw(share < 1 ? mix(share) : frame, head, expert);
+  pictured = now;
   if (!fresh) return;
   fresh = false;
   pictures.push(now);
@@ -371,13 +374,14 @@ function draw() {
   if (pictures.length > KEPT) pictures.shift();
   if (head.echo !== echoed) {
     echoed = head.echo;
-    ways.push((now - echoed + CLOCK) % CLOCK + (1 - share) * span);
+    ways.push((performance.now() - echoed + CLOCK) % CLOCK + (1 - share) * span);
     if (ways.length > KEPT) ways.shift();
   }
   // One a picture: ten times a second is enough for curves.
   [() => plots.force.draw(scene.force_limit), () => plots.way.draw(undefined, 2, 0.5), () => plots.rate.draw(undefined, 0)][turn++ % 3]();
 }
 requestAnimationFrame(draw);
+setInterval(() => running && hand.say().forEach(say), TELL);
 
 // Returns numbers between the last two frames.
 function mix(share) {

@@ -79,7 +79,7 @@ export class View {
     this.shades = {value: scene.tips.slice(0, SHADES).flatMap(() => [new THREE.Vector3(9, 9, 9), new THREE.Vector3(9, 9, 9)])};
     this.world = new THREE.Scene();
     this.world.background = new THREE.Color(0x120505);
-    this.papers = new Map(Object.entries(scene.textures).map(([key, value]) => [Number(key), paper(value)]));
+    this.papers = new Map(Object.entries(scene.textures).map(([key, value]) => [Number(key), paper(value, this.wet)]));
     this.lenses = [];  // lamps that go with the eye
     for (const light of scene.lights) {
       const made = lamps(light);
@@ -87,8 +87,8 @@ export class View {
       if (light.lens) this.lenses.push(made[1]);
     }
     for (const each of scene.scenery) {
-      const mesh = new THREE.Mesh(shape(each), this.surface(each.look));
-      this.world.add(mesh);
+      const material = this.surface(each.look);
+      this.world.add(new THREE.Mesh(shape(each), this.wet ? shade(material, this.shades) : material));
     }
     this.parts = scene.parts.map(part => {
       const mesh = new THREE.Mesh(creased(shape(part.shape)), this.surface(part.look, true));
@@ -119,7 +119,7 @@ export class View {
 
   // The organ: what is drawn for it, its mesh, and what cuts have opened.
   weave({look, inside, topology, smooth}) {
-    const material = this.surface(look, false, smooth ? THREE.FrontSide : THREE.DoubleSide);
+    const material = shade(this.surface(look, false, smooth ? THREE.FrontSide : THREE.DoubleSide), this.shades);
     this.inside = new THREE.Color().setRGB(...inside.slice(0, 3), THREE.SRGBColorSpace);
     this.smooth = smooth && {
       from: unpack(smooth.indptr), nodes: unpack(smooth.indices), share: unpack(smooth.data), count: unpack(smooth.indptr).length - 1,
@@ -132,8 +132,9 @@ export class View {
       if (smooth.uv) this.organ.geometry.setAttribute("uv", new THREE.BufferAttribute(unpack(smooth.uv), 2));
     }
     this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshBasicMaterial({wireframe: true, color: 0xf0b8a0}));
-    this.walls = new THREE.Mesh(new THREE.BufferGeometry(), this.surface({rgba: [1, 1, 1, 1], specular: 0.7, shininess: 0.8}, false, THREE.DoubleSide));
-    this.walls.material.color.copy(this.inside);
+    const wall = this.surface({rgba: [1, 1, 1, 1], specular: 0.7, shininess: 0.8}, false, THREE.DoubleSide);
+    wall.color.copy(this.inside);
+    this.walls = new THREE.Mesh(new THREE.BufferGeometry(), shade(wall, this.shades));
     this.mesh.frustumCulled = this.walls.frustumCulled = false;
     this.world.add(this.organ, this.mesh, this.walls);
     this.sew(topology);
@@ -183,16 +184,15 @@ export class View {
     const map = this.papers.get(texture) ?? null, metal = hard && specular > 0.85;
     if (map && repeat) map.repeat.set(...repeat);
     const common = {color, map, side, transparent: rgba[3] < 1, opacity: rgba[3]};
-    const shaded = material => hard ? material : shade(material, this.shades);
     if (!this.wet) {
       const shine = new THREE.Color(1, 1, 1).multiplyScalar(metal ? 0.9 : 0.35 * specular);
-      return shaded(new THREE.MeshPhongMaterial({...common, specular: shine, shininess: 20 + 60 * shininess}));
+      return new THREE.MeshPhongMaterial({...common, specular: shine, shininess: 20 + 60 * shininess});
     }
     const rough = {roughness: metal ? 0.3 : 0.5, metalness: metal ? 0.75 : 0};
     const film = hard ? {clearcoat: metal ? 0 : 0.4, clearcoatRoughness: 0.3} : {
       clearcoat: 0.35 + specular, clearcoatRoughness: 0.32 - 0.15 * shininess, bumpMap: map, bumpScale: 1.2,
     };
-    return shaded(new THREE.MeshPhysicalMaterial({...common, ...rough, ...film, envMap: hard ? this.mirror : null, envMapIntensity: 1}));
+    return new THREE.MeshPhysicalMaterial({...common, ...rough, ...film, envMap: hard ? this.mirror : null});
   }
 
   // The eye: place, and the axes right, up, back; turned and moved in a free view.
@@ -522,16 +522,16 @@ ${shader.fragmentShader}`.replace("#include <opaque_fragment>", "outgoingLight *
 }
 
 // Pictures and lights.
-function paper({width, height, pixels}) {
+function paper({width, height, pixels}, fine) {
   const rgb = unpack(pixels), rgba = new Uint8Array(4 * width * height).fill(255);
   for (let i = 0; i < width * height; i++) rgba.set(rgb.subarray(3 * i, 3 * i + 3), 4 * i);
   const texture = new THREE.DataTexture(rgba, width, height);
   texture.colorSpace = THREE.SRGBColorSpace;
   texture.wrapS = texture.wrapT = THREE.RepeatWrapping;
   texture.magFilter = THREE.LinearFilter;
-  texture.minFilter = THREE.LinearMipmapLinearFilter;
+  texture.minFilter = fine ? THREE.LinearMipmapLinearFilter : THREE.LinearMipmapNearestFilter;
   texture.generateMipmaps = true;
-  texture.anisotropy = 8;
+  texture.anisotropy = fine ? 8 : 1;
   texture.needsUpdate = true;
   return texture;
 }
