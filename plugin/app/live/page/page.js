@@ -16,7 +16,7 @@ const WORDS = 100;  // between numbers in words, which are laid out anew [ms]
 const ENOUGH = 40, PROMPT = 0.9;  // frames to judge by whether most of them are drawn
 const LONGEST = 100;  // that a picture lies behind what came [ms]
 const KEPT = 5000;  // of the times from hand to picture
-const TELL = 8;  // between looks at the hand [ms]; pictures may be further apart
+const TELL = 8;  // between looks at the hand [ms]
 
 const asked = new URLSearchParams(location.hash.slice(1));
 speak();
@@ -356,8 +356,12 @@ function targets() {
   return Array.from({length: scene.targets}, (_, i) => [...sites.subarray(each * i, each * i + 8)]);
 }
 
+const hear = () => running && hand.say().forEach(say);
+setInterval(hear, TELL);  // pictures may be further apart
+
 function draw() {
   requestAnimationFrame(draw);
+  hear();  // drawing may take long
   if (!frame) return;
   const expert = trace && on("ghost") ? trace : null, state = view.state(), now = performance.now();
   // A picture lies between frames where it comes as often as they do.
@@ -381,7 +385,6 @@ function draw() {
   [() => plots.force.draw(scene.force_limit), () => plots.way.draw(undefined, 2, 0.5), () => plots.rate.draw(undefined, 0)][turn++ % 3]();
 }
 requestAnimationFrame(draw);
-setInterval(() => running && hand.say().forEach(say), TELL);
 
 // Returns numbers between the last two frames.
 function mix(share) {
