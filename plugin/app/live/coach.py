@@ -15,7 +15,7 @@ from palpate.tasks.recording import Recording
 _STAYS = 0.6  # how long a warning is shown [s]
 _STILL = 1e-3  # path of a hand that has not moved [m]
 # What helps, by metric; those that are left out say so by their names.
-_ADVICE = {
+ADVICE = {
   "peak_force": "approach slowly and stop at the first resistance",
   "mean_force": "stay in light contact, less is enough",
   "force_breaches": "watch the force bar, and ease off before it turns red",
@@ -159,7 +159,7 @@ def judge(recording: Recording, reference: Mapping[str, Any] | None) -> Judged:
 def _help(name: str, recording: Recording) -> str:
   """Returns what helps with a metric; one movement cannot be made of several."""
   single = name == "log_dimensionless_jerk" and recording.metrics().number_of_movements < 2
-  return "" if single else _ADVICE.get(name, "")
+  return "" if single else ADVICE.get(name, "")
 
 
 def _row(name: str, recording: Recording, reference: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -2,13 +2,17 @@
 
 import copy
 import dataclasses
+import pathlib
+import re
 
 import numpy as np
 import palpate
 import pytest
-from palpate.app.live.coach import Coach, card
+from palpate.app.live import page
+from palpate.app.live.coach import ADVICE, Coach, card
 from palpate.tasks import suite
 from palpate.tasks.core import episode, performer
+from palpate.tasks.metrics import METRICS
 from palpate.tasks.people.score import reference
 
 
@@ -112,3 +116,15 @@ def test_one_smooth_movement_is_asked_for_where_there_were_several():
   shown = card(made, strict)
   assert "Log dimensionless jerk" in [row["label"] for row in shown["better"]]
   assert any("one smooth movement" in text for text in shown["helps"]) == several
+
+
+def test_what_is_said_is_in_the_table_of_words():
+  """Exercises, metrics and what helps have German words; numbers stay in their order."""
+  texts = pathlib.Path(str(page.__file__)).with_name("texts.js")
+  german = texts.read_text().partition("const ENGLISH")[0]
+  words = dict(re.findall(r'"((?:[^"\\]|\\.)*)":\s*"((?:[^"\\]|\\.)*)"', german))
+  names = [name for pair in suite.ALL_TASKS for name in pair]
+  said = [re.sub(r"\d+(\.\d+)?", "#", suite.summary(*pair)) for pair in suite.ALL_TASKS]
+  said += [*names, *(spec.label for spec in METRICS.values()), *ADVICE.values()]
+  assert not {text for text in said if text not in words}
+  assert not {text for text, other in words.items() if text.count("#") != other.count("#")}

@@ -145,7 +145,7 @@ def test_a_needle_stays_in_the_jaws_until_the_hand_has_closed_them_and_opens():
   env, held = load("suture/drive_easy", input="tip", time_limit=2), []
   closed = lambda t: frozenset({"grip"} if 0.4 < t < 0.6 else ())  # noqa: E731
   hand = live.Hand(lambda t: (0.0, 0.01 * t, 0.0), buttons=closed)
-  look = lambda env: held.append((env.physics.time(), env.task.holds))  # noqa: E731
+  look = lambda env: held.append((env.physics.time(), env.task.right_holds))  # noqa: E731
   made = session(env, hand).run(watch=look)
   assert made.outcome == "missed"  # it fell
   assert all(holds for time, holds in held if time < 0.6)

@@ -54,7 +54,7 @@ export function show(place, menu, start) {
       picture.loading = "lazy";
       card.dataset.task = task;
       card.disabled = Boolean(after);
-      card.append(picture, make("strong", "", t(task.split("/")[1])), make("span", "what", menu.tasks[task]), make("span", "status", status), make("span", "tried", tried));
+      card.append(picture, make("strong", "", t(task.split("/")[1])), make("span", "what", t(menu.tasks[task])), make("span", "status", status), make("span", "tried", tried));
       card.onclick = () => start(task);
       return card;
     }));

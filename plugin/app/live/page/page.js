@@ -77,7 +77,7 @@ const HEAR = {
       group.label = domain;
       group.append(...names.map(name => {
         const after = menu.locked[name];
-        const option = new Option(`${name}: ${menu.tasks[name]}${after ? ` (${t("after {0}", after)})` : ""}`, name);
+        const option = new Option(`${name}: ${t(menu.tasks[name])}${after ? ` (${t("after {0}", after)})` : ""}`, name);
         option.disabled = Boolean(after);
         return option;
       }));
