@@ -33,7 +33,7 @@ _MOST_PAIRS = 32  # of edges near each other, for one node
 _SOFT = 0.05  # modulus across a thread over that along it, an estimate
 _SLOW = 1e-6  # velocity below which friction within a thread is viscous [m/s]
 _MUJOCOS = (
-  *("jacobian", "flex_margin", "qvel", "qacc_warmstart"),
+  *("jacobian", "flex_margin", "qvel", "qacc", "qacc_warmstart", "qfrc_smooth"),
   *("M_rowadr", "M_rownnz", "M_colind"),
 )
 _HUGE = 1e6  # more than any twist [rad]
@@ -67,7 +67,6 @@ class Rod:
   # A step:
   start: doubles("nnode", 3)  # place as it begins, in the slides' axes [m]
   vel: doubles("nnode", 3)  # velocity then [m/s]
-  last: doubles("nnode", 3)  # acceleration of the last step [m/s^2]
   external: doubles("nnode", 3)  # force besides elasticity and constraints [N]
   aim: doubles("nnode", 3)  # place where it would end without these [m]
   place: doubles("nnode", 3)  # place as it ends [m]
@@ -122,7 +121,9 @@ class Bound:
   jacobian: ints(1)
   flex_margin: doubles("nflex")
   qvel: doubles("nv")
+  qacc: doubles("nv")
   qacc_warmstart: doubles("nv")
+  qfrc_smooth: doubles("nv")
   M_rowadr: ints("nv")
   M_rownnz: ints("nv")
   M_colind: ints("nC")
@@ -236,7 +237,7 @@ def settings(organ: Declaration, friction: float) -> dict:
 
 def scratch(n: int) -> dict[str, np.ndarray]:
   """Returns the fields of `Rod` that a step of n nodes writes."""
-  nodes = ("start", "vel", "last", "external", "aim", "place", "listed")
+  nodes = ("start", "vel", "external", "aim", "place", "listed")
   unknowns = ("force", "move", "trial", "gradient", "first", "start_of_row", "below")
   pairs, rows, entries = _MOST_PAIRS * n, _MOST_ROWS * n, 2 * n * (4 * n + 1)
   return dict(

@@ -229,6 +229,37 @@ def test_a_needle_swings_on_its_thread(mass):
   assert thread.error is None
 
 
+@pytest.mark.parametrize("condim", [3, 6])
+@pytest.mark.parametrize(("share", "holds"), [(0.9, True), (1.2, False)])
+def test_jaws_hold_a_thread_by_friction(condim, share, holds):
+  """Two jaws of 200 g press with 2 N each: they hold 2 mu N of a thread of some milligrams."""
+  mu, press = 0.5, 2.0
+  jaw = """<body pos="0.01 0 {z}"><joint name="j{k}" type="slide" axis="0 0 {way}" damping="20"/>
+    <geom type="box" size="0.004 0.002 0.001" mass="0.2" condim="{condim}" friction="{mu} 0.001 3e-4"
+      solref="0.002 1" solmix="1000"/></body>"""
+  world = "".join(
+    jaw.format(k=k, z=-way * 0.0013, way=way, condim=condim, mu=mu) for k, way in enumerate((-1, 1))
+  )
+  motors = "".join(f'<motor joint="j{k}" ctrllimited="false"/>' for k in range(2))
+  option = f'{FREE} cone="elliptic" impratio="10"'
+  model, data, thread = load(
+    line(41, 0.02), option=option, world=world, after=f"<actuator>{motors}</actuator>",
+    contact='friction="0.1 0 0"',
+  )  # fmt: skip
+  data.ctrl[:] = press
+  run(model, data, 150)
+  assert np.abs(data.qvel).max() < 1e-4
+  start = thread.positions[20, 0]
+  for k in range(250):
+    force(model, data, 40, (share * 2 * mu * press * min(1.0, k / 100), 0, 0))
+    run(model, data, 1)
+  slid = thread.positions[20, 0] - start
+  assert abs(slid) < 2e-5 if holds else slid > 2e-3
+  if holds:
+    np.testing.assert_allclose(thread.tension[-4:], share * 2 * mu * press, rtol=1e-3)
+    assert thread.error is None
+
+
 def test_forward_twice_changes_nothing():
   motion = []
   for extra in (0, 2):

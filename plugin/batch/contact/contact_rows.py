@@ -244,7 +244,7 @@ class Early:
 
 @wp.kernel(enable_backward=False)
 def take_early(f: Early):
-  """Takes margin and parting off the gaps of threads' contacts, see `keep_closed`."""
+  """Takes the margin off the gaps of threads' contacts, see `coupling/mujoco_rod.h`."""
   c = wp.tid()
   if c >= f.nacon[0]:
     return
@@ -262,7 +262,6 @@ def take_early(f: Early):
   spring = contact_kbimp(f.disableflags, f.timestep, f.solref[c], f.solimp[c], gap, f.discrete == 1)
   world = f.worldid[c]
   off = spring[0] * spring[2] * f.margin[thread]
-  off += parting(f.paired, n, c, world, f.friction, f.efc_address, f.aref)
   for r in range(wp.where(f.paired == 1, rows, 1)):
     row = f.efc_address[c, r]
     f.aref[world, row] = f.aref[world, row] - off

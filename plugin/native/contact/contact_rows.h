@@ -181,6 +181,12 @@ PALPATE double parting(const Fields& f, const char* contact, Rows rows) {
   return sqrt(sum);
 }
 
+// Gives a contact another gap than MuJoCo found.
+template <class Fields>
+PALPATE void set_gap(const Fields& f, Rows rows, double gap) {
+  for (int r = 0; r < rows.normals().count; ++r) datum<double*>(f, DATA_EFC_POS)[rows.first + r] = gap;
+}
+
 // Moves the contact's gap by what lies off it, and by as much as takes that parting away: sliding then
 // has the gap, and the force, of standing (de Saxce and Feng 1998, doi:10.1016/S0895-7177(98)00119-8,
 // with the velocity that the step begins with). Done twice it does nothing.
@@ -191,7 +197,7 @@ PALPATE void keep_closed(const Fields& f, const char* contact, Rows rows, double
   if (!(stiffness > 0.0)) return;
   double gap = *(const double*)(contact + CONTACT_DIST) + off;
   if (rows.count > 1) gap += parting(f, contact, rows) / stiffness;
-  for (int r = 0; r < rows.normals().count; ++r) datum<double*>(f, DATA_EFC_POS)[rows.first + r] = gap;
+  set_gap(f, rows, gap);
 }
 
 }  // namespace palpate

@@ -34,11 +34,19 @@ struct MujocoRod {
   PALPATE void set_inertia(int i, D3 Mhat) const {
     palpate::set_inertia(f.mj, f.massadr.data + 3 * i, f.dofadr.data[i], Mhat);
   }
-  PALPATE void push(int i, D3 force) const {
-    double* out = f.mj.qfrc_passive.data + f.dofadr.data[i];
-    store(out, load(out) + force);
+  // The solver starts where the rod's step leads.
+  PALPATE void push(int i, D3 force, D3 acceleration) const {
+    const int adr = f.dofadr.data[i];
+    store(f.mj.qfrc_passive.data + adr, load(f.mj.qfrc_passive.data + adr) + force);
+    store(f.qacc_warmstart.data + adr, acceleration);
   }
-  PALPATE D3 found(int i) const { return load(f.mj.qfrc_constraint.data + f.dofadr.data[i]); }
+  // The force of constraints by the node's acceleration: that is what MuJoCo's solver finds, to more digits than
+  // the large forces that cancel on a node between jaws.
+  PALPATE D3 found(int i) const {
+    const int adr = f.dofadr.data[i];
+    const D3 Mhat = inertia(i), a = load(f.qacc.data + adr);
+    return D3{Mhat.x * a.x, Mhat.y * a.y, Mhat.z * a.z} - load(f.qfrc_smooth.data + adr);
+  }
   PALPATE void move(int i, D3 moved, double h) const {
     const int q = f.qposadr.data[i];
     const D3 at = load(rod.start.data + 3 * i) - load(f.rest.data + 3 * i) + load(f.mj.qpos0.data + q);
@@ -61,7 +69,9 @@ struct MujocoRod {
   }
 
   // Notes the rows of constraints that act on the rod. Contacts are there before they touch, by the flex's
-  // margin, which is taken off again: one that came a step late would find light nodes far inside.
+  // margin, which is taken off again: one that came a step late would find light nodes far inside. Sliding ones are not
+  // kept closed as those of organs are: a thread follows by itself, and between jaws the velocity of the last step
+  // would take away the force that holds it.
   PALPATE void note_rows() const {
     const int nefc = datum<int>(f, DATA_NEFC), ncon = nefc > 0 ? datum<int>(f, DATA_NCON) : 0;
     char* const contacts = datum<char*>(f, DATA_CONTACT);
@@ -73,7 +83,7 @@ struct MujocoRod {
         empty(rows);
         continue;
       }
-      keep_closed(f, contact, rows, f.flex_margin.data[f.flex]);
+      set_gap(f, rows, *(const double*)(contact + CONTACT_DIST) + f.flex_margin.data[f.flex]);
       note_contact(*this, rows.first, rows.count, !rows.paired && rows.count > 1,
                    *(const double*)(contact + CONTACT_MU), (const double*)(contact + CONTACT_FRICTION));
     }
@@ -89,12 +99,11 @@ struct MujocoRod {
     each_lane(0, rod.nnode, [&](int i) {
       const int adr = f.dofadr.data[i], q = f.qposadr.data[i], body = f.bodyid.data[i];
       rod.turn.data[i] = 0.0;
-      D3 x = load(f.rest.data + 3 * i), v = zero, force = zero, last = zero;
+      D3 x = load(f.rest.data + 3 * i), v = zero, force = zero;
       if (adr >= 0) {
         const double m = rod.mass.data[i] = mj.body_mass.data[body];
         x += load(mj.qpos.data + q) - load(mj.qpos0.data + q);
         v = load(mj.qvel.data + adr);
-        last = load(f.qacc_warmstart.data + adr);
         const D3 along = m * gravity + load(mj.qfrc_applied.data + adr) + load(mj.qfrc_passive.data + adr);
         force = external(along, R, mj.xfrc_applied.data + 6 * body);
         store(rod.aim.data + 3 * i, x + h * v + (h * h / m) * force);
@@ -103,7 +112,6 @@ struct MujocoRod {
       }
       store(rod.start.data + 3 * i, x);
       store(rod.vel.data + 3 * i, v);
-      store(rod.last.data + 3 * i, last);
       store(rod.external.data + 3 * i, force);
     });
   }

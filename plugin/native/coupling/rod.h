@@ -25,7 +25,8 @@ namespace palpate {
 template <class Number>
 struct RowOf { Number* value; const int* dof; int count; };
 
-// The first node of the rod that a row reaches, or -1: none, or more than two that are neighbours.
+// The first node of the rod that a row reaches, or NOWHERE, or APART: more than two that are neighbours.
+constexpr int NOWHERE = -1, APART = -2;
 template <class Host, class Row>
 PALPATE int first_node(const Host& host, Row row) {
   int first = -1, last = -1;
@@ -35,7 +36,7 @@ PALPATE int first_node(const Host& host, Row row) {
     if (first < 0 || own / 3 < first) first = own / 3;
     if (own / 3 > last) last = own / 3;
   }
-  return last - first > 1 ? -1 : first;
+  return last - first > 1 ? APART : first;
 }
 
 // How other bodies give way to a row's force, J M^-1 J^T of their dofs [1/kg], by MuJoCo's factors of M. A row
@@ -60,13 +61,14 @@ PALPATE double yields(const Host& host, Row row) {
   return sum;
 }
 
-// Notes MuJoCo's row `r` where it acts on the rod; returns whether it does.
+// Notes MuJoCo's row `r` where it acts on the rod; returns whether it does. A row of a cone that turns others
+// about the contact does not reach nodes, and is one of the node `cone`.
 template <class Host>
-PALPATE bool note_row(const Host& host, int r, int kind, double friction) {
+PALPATE bool note_row(const Host& host, int r, int kind, double friction, int cone = NOWHERE) {
   const auto& rod = host.rod;
   const int at = rod.count.data[0];
   const auto row = host.row(r);
-  const int node = first_node(host, row);
+  const int reached = first_node(host, row), node = reached == NOWHERE ? cone : reached;
   if (node < 0 || at >= rod.most_rows) return false;
   double* J = rod.row_value.data + (DOFS + 3) * at;
   double sum = -host.reference(r);
@@ -94,7 +96,8 @@ PALPATE void note_contact(const Host& host, int first, int count, bool cone, dou
   const int before = host.rod.count.data[0];
   for (int k = 0; k < count; ++k) {
     const double slope = !cone ? 0.0 : k ? (double)friction[k - 1] : mu;
-    const bool noted = note_row(host, first + k, !cone ? ONE : k ? FRICTION : CONE, slope);
+    const int node = cone && k ? host.rod.row_node.data[before] : NOWHERE;
+    const bool noted = note_row(host, first + k, !cone ? ONE : k ? FRICTION : CONE, slope, node);
     if (noted || !cone) continue;
     host.rod.count.data[0] = before;
     break;
@@ -189,9 +192,9 @@ PALPATE void begin(const Host& host, double h) {
       host.set_inertia(i, Mhat = {inertia, inertia, inertia});
     }
     const D3 dv = (1.0 / h) * (load(rod.place.data + 3 * i) - load(rod.start.data + 3 * i)) - load(rod.vel.data + 3 * i);
-    const D3 rate = (1.0 / h) * D3{Mhat.x * dv.x, Mhat.y * dv.y, Mhat.z * dv.z};
+    const D3 acceleration = (1.0 / h) * dv, rate = {Mhat.x * acceleration.x, Mhat.y * acceleration.y, Mhat.z * acceleration.z};
     const D3 lagged = load(rod.external.data + 3 * i) - (touched ? load(rod.force.data + 4 * i) : D3{0.0, 0.0, 0.0});
-    host.push(i, passive(rate, lagged));
+    host.push(i, passive(rate, lagged), acceleration);
   });
 }
 

@@ -38,12 +38,11 @@ struct WorldRod {
     f.M.data[at[0]] = (float)Mhat.x, f.M.data[at[1]] = (float)Mhat.y, f.M.data[at[2]] = (float)Mhat.z;
   }
   // The solver starts where the rod's step leads.
-  PALPATE void push(int i, D3 force) const {
+  PALPATE void push(int i, D3 force, D3 acceleration) const {
     const int adr = f.dofadr.data[i];
     float* out = f.qfrc_passive.data + adr;
     store(out, load(out) + force);
-    const D3 dv = (1.0 / f.timestep) * (load(rod.place.data + 3 * i) - load(rod.start.data + 3 * i)) - load(rod.vel.data + 3 * i);
-    store(f.qacc_warmstart.data + adr, (1.0 / f.timestep) * dv);
+    store(f.qacc_warmstart.data + adr, acceleration);
   }
   PALPATE D3 found(int i) const { return load(f.qfrc_constraint.data + f.dofadr.data[i]); }
 
@@ -112,19 +111,17 @@ struct WorldRod {
     each_lane(0, rod.nnode, [&](int i) {
       const int adr = f.dofadr.data[i];
       rod.turn.data[i] = 0.0;
-      D3 x = load(f.rest.data + 3 * i), v = none, force = none, last = none, aim = x;
+      D3 x = load(f.rest.data + 3 * i), v = none, force = none, aim = x;
       if (adr >= 0) {
         const double m = rod.mass.data[i];
         x = exact(f.qpos.data + f.qposadr.data[i], load(f.now.data + 3 * i) + zero(i)) - zero(i);
         v = exact(f.qvel.data + adr, load(f.speed.data + 3 * i));
-        last = load(f.qacc_warmstart.data + adr);
         const D3 along = m * gravity + load(f.qfrc_applied.data + adr) + load(f.qfrc_passive.data + adr);
         force = add_turned(along, R, load((const float*)f.xfrc_applied.data + 6 * f.bodyid.data[i]));
         aim = x + h * v + (h * h / m) * force;
       }
       store(rod.start.data + 3 * i, x);
       store(rod.vel.data + 3 * i, v);
-      store(rod.last.data + 3 * i, last);
       store(rod.external.data + 3 * i, force);
       store(rod.aim.data + 3 * i, aim);
     });

@@ -208,12 +208,10 @@ PALPATE void solve_nodes(const Fields& f, double* b) {
   });
 }
 
-// Starts from where the nodes go with their last acceleration, as far as they do not meet.
+// Starts from where the nodes go with their velocity, as far as they do not meet.
 template <class Fields>
 PALPATE void predict(const Fields& f, double h) {
-  each_lane(0, f.nnode, [&](int i) {
-    store(f.trial.data + 3 * i, h * load(f.vel.data + 3 * i) + h * h * load(f.last.data + 3 * i));
-  });
+  each_lane(0, f.nnode, [&](int i) { store(f.trial.data + 3 * i, h * load(f.vel.data + 3 * i)); });
   const double part = safe_part(f, f.start.data, f.trial.data, 3);
   each_lane(0, 3 * f.nnode, [&](int a) { f.place.data[a] = f.start.data[a] + part * f.trial.data[a]; });
 }
