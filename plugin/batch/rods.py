@@ -269,7 +269,7 @@ class Rods:
       nacon=batch.d.nacon,
       aref=batch.d.efc.aref,
       **{name: getattr(contact, name) for name in (
-        "dim", "flex", "worldid", "dist", "includemargin", "friction", "solref", "solimp",
+        "dim", "flex", "worldid", "dist", "includemargin", "solref", "solimp",
         "efc_address")},
     ))  # fmt: skip
 

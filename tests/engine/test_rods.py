@@ -235,8 +235,8 @@ def test_jaws_hold_a_thread_by_friction(condim, share, holds):
   """Two jaws of 200 g press with 2 N each: they hold 2 mu N of a thread of some milligrams."""
   mu, press = 0.5, 2.0
   jaw = """<body pos="0.01 0 {z}"><joint name="j{k}" type="slide" axis="0 0 {way}" damping="20"/>
-    <geom type="box" size="0.004 0.002 0.001" mass="0.2" condim="{condim}" friction="{mu} 0.001 3e-4"
-      solref="0.002 1" solmix="1000"/></body>"""
+    <geom type="box" size="0.004 0.002 0.001" mass="0.2" condim="{condim}" solmix="1000"
+      friction="{mu} 0.001 3e-4" solref="0.002 1"/></body>"""
   world = "".join(
     jaw.format(k=k, z=-way * 0.0013, way=way, condim=condim, mu=mu) for k, way in enumerate((-1, 1))
   )

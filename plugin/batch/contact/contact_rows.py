@@ -235,7 +235,6 @@ class Early:
   worldid: ints("naconmax")
   dist: floats("naconmax")
   includemargin: floats("naconmax")
-  friction: Array(vec5, ("naconmax",))
   solref: Array(wp.vec2, ("naconmax",))
   solimp: Array(vec5, ("naconmax",))
   efc_address: ints("naconmax", "nrow")
