@@ -69,7 +69,8 @@ class WorldRods:
   qfrc_applied: floats("nworld", "nv")
   xfrc_applied: floats("nworld", "nbody6")
   qfrc_passive: floats("nworld", "nv")
-  qfrc_constraint: floats("nworld", "nv")
+  qfrc_smooth: floats("nworld", "nv")
+  qacc: floats("nworld", "nv")
   qacc_warmstart: floats("nworld", "nv")
   M: floats("nworld", "nC")
   nefc: ints("nworld")
@@ -269,7 +270,7 @@ class Rods:
       nacon=batch.d.nacon,
       aref=batch.d.efc.aref,
       **{name: getattr(contact, name) for name in (
-        "dim", "flex", "worldid", "dist", "includemargin", "solref", "solimp",
+        "dim", "flex", "worldid", "dist", "includemargin", "friction", "solref", "solimp",
         "efc_address")},
     ))  # fmt: skip
 

@@ -235,6 +235,7 @@ class Early:
   worldid: ints("naconmax")
   dist: floats("naconmax")
   includemargin: floats("naconmax")
+  friction: Array(vec5, ("naconmax",))
   solref: Array(wp.vec2, ("naconmax",))
   solimp: Array(vec5, ("naconmax",))
   efc_address: ints("naconmax", "nrow")
@@ -243,7 +244,7 @@ class Early:
 
 @wp.kernel(enable_backward=False)
 def take_early(f: Early):
-  """Takes the margin off the gaps of threads' contacts, see `coupling/mujoco_rod.h`."""
+  """Takes margin, and parting on organs, off threads' gaps, see `coupling/mujoco_rod.h`."""
   c = wp.tid()
   if c >= f.nacon[0]:
     return
@@ -261,6 +262,8 @@ def take_early(f: Early):
   spring = contact_kbimp(f.disableflags, f.timestep, f.solref[c], f.solimp[c], gap, f.discrete == 1)
   world = f.worldid[c]
   off = spring[0] * spring[2] * f.margin[thread]
+  if f.flex[c][0] >= 0 and f.flex[c][1] >= 0:
+    off += parting(f.paired, n, c, world, f.friction, f.efc_address, f.aref)
   for r in range(wp.where(f.paired == 1, rows, 1)):
     row = f.efc_address[c, r]
     f.aref[world, row] = f.aref[world, row] - off

@@ -69,8 +69,8 @@ struct MujocoRod {
   }
 
   // Notes the rows of constraints that act on the rod. Contacts are there before they touch, by the flex's
-  // margin, which is taken off again: one that came a step late would find light nodes far inside. Sliding ones are not
-  // kept closed as those of organs are: a thread follows by itself, and between jaws the velocity of the last step
+  // margin, which is taken off again: one that came a step late would find light nodes far inside. Those that
+  // slide on geoms are not kept closed: a thread follows by itself, and between jaws the velocity of the last step
   // would take away the force that holds it.
   PALPATE void note_rows() const {
     const int nefc = datum<int>(f, DATA_NEFC), ncon = nefc > 0 ? datum<int>(f, DATA_NCON) : 0;
@@ -83,7 +83,11 @@ struct MujocoRod {
         empty(rows);
         continue;
       }
-      set_gap(f, rows, *(const double*)(contact + CONTACT_DIST) + f.flex_margin.data[f.flex]);
+      const double margin = f.flex_margin.data[f.flex];
+      if (side_of(contact, CONTACT_FLEX, 0) >= 0 && side_of(contact, CONTACT_FLEX, 1) >= 0)
+        keep_closed(f, contact, rows, margin);  // with an organ
+      else
+        set_gap(f, rows, *(const double*)(contact + CONTACT_DIST) + margin);
       note_contact(*this, rows.first, rows.count, !rows.paired && rows.count > 1,
                    *(const double*)(contact + CONTACT_MU), (const double*)(contact + CONTACT_FRICTION));
     }

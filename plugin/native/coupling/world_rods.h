@@ -44,7 +44,10 @@ struct WorldRod {
     store(out, load(out) + force);
     store(f.qacc_warmstart.data + adr, acceleration);
   }
-  PALPATE D3 found(int i) const { return load(f.qfrc_constraint.data + f.dofadr.data[i]); }
+  PALPATE D3 found(int i) const {  // see `MujocoRod`
+    const D3 Mhat = inertia(i), a = load(f.qacc.data + f.dofadr.data[i]);
+    return D3{Mhat.x * a.x, Mhat.y * a.y, Mhat.z * a.z} - load(f.qfrc_smooth.data + f.dofadr.data[i]);
+  }
 
   // Where qpos has a place, from rest.
   PALPATE D3 zero(int i) const { return load(f.qpos0.data + f.qposadr.data[i]) - load(f.rest.data + 3 * i); }
@@ -131,7 +134,7 @@ struct WorldRod {
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
   move_each(world, f.solution, f.factor, f.inverse_diagonal, f.now, f.speed, f.gravity, f.qpos, f.qvel, f.qfrc_applied,
-            f.xfrc_applied, f.qfrc_passive, f.qfrc_constraint, f.qacc_warmstart, f.M, f.nefc, f.type, f.id, f.J,
+            f.xfrc_applied, f.qfrc_passive, f.qfrc_smooth, f.qacc, f.qacc_warmstart, f.M, f.nefc, f.type, f.id, f.J,
             f.J_rownnz, f.J_rowadr, f.J_colind, f.D, f.aref);
   return f;
 }
