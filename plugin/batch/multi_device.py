@@ -201,7 +201,7 @@ class _Gathered(Tissue):
   def _each(self, name: str, parts: Sequence[Any]) -> list[wp.array]:
     """Returns the arrays of named tuples of all parts, in their order."""
     return [
-      self._gather(f"{name}_{field}", [getattr(part, field) for part in parts])
+      self._gather(f"{name}.{field}", [getattr(part, field) for part in parts])
       for field in parts[0]._fields
     ]
 
