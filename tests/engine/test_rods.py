@@ -321,7 +321,10 @@ def test_a_thread_over_an_organ_is_borne_by_it():
 
 @pytest.mark.parametrize("made", [dict(first="t"), dict(nodes=120), dict(first="t", nodes=120)])
 def test_order_and_windows_change_nothing(made):
-  """But for what single precision changes; the ball is dented by 0.8 mm."""
+  """But for what single precision changes; the ball is dented by 0.8 mm.
+
+  With MuJoCo 4 the order changes 1e-10 m; that of 3.17 lets it change contacts, by 2e-5 m.
+  """
   places = []
   for spec in (draped(), draped(**made)):
     model = spec.compile()
@@ -335,7 +338,8 @@ def test_order_and_windows_change_nothing(made):
     assert thread.error is organ.error is None
     assert organ.window_overflow in ((), (0, 0))
     places.append(organ.xpos)
-  np.testing.assert_allclose(*places, atol=2e-5)
+  newer = int(mujoco.__version__.split(".")[0]) >= 4
+  np.testing.assert_allclose(*places, atol=1e-5 if newer else 3e-5)
 
 
 # States.
