@@ -97,6 +97,7 @@ def add_needle(
   body = where.add_body(name=name, pos=pos, quat=quat)
   if parent is None:
     body.add_freejoint(name=name)
+  _draw(spec, body, circle, angle, 0.5 * diameter, rgba)
   look = {"condim": 4, "friction": (1.0, 0.005, 0.0001)} | dict(contact or {})
   for k in range(_CAPSULES):
     point = _CAPSULES - k  # from the tip, 1 for the last
@@ -107,7 +108,6 @@ def add_needle(
       name=f"{name}_{k}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends,
       size=[radius, 0, 0], mass=mass / _CAPSULES, group=_HIDDEN, rgba=rgba, **(look | meets),
     )  # fmt: skip
-  _draw(spec, body, circle, angle, 0.5 * diameter, rgba)
   for end, k, half in (("swage", 0, diameter / 2), ("tip", -1, TIPS[tip] * diameter / 2)):
     along = (-np.sin(angle[k]), np.cos(angle[k]), 0.0)
     size = [half, half, half]

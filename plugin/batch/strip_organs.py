@@ -51,12 +51,11 @@ def tools_of(model: mujoco.MjModel, organ: Declaration) -> np.ndarray:
   Raises:
     ValueError: one is not a tool that a batch knows.
   """
-  if organ.windows:
-    found = np.unique(organ.windows.geom)
-  else:
-    contype, conaffinity = model.flex_contype[organ.flex], model.flex_conaffinity[organ.flex]
-    meets = (model.geom_contype & conaffinity) | (model.geom_conaffinity & contype)
-    found = np.flatnonzero(meets)
+  flex = organ.windows.flex if organ.windows else organ.flex
+  contype, conaffinity = model.flex_contype[flex], model.flex_conaffinity[flex]
+  found = np.flatnonzero((model.geom_contype & conaffinity) | (model.geom_conaffinity & contype))
+  if organ.windows:  # which follow tips of needles that meet nothing too
+    found = np.intersect1d(found, organ.windows.geom)
   for g in found:
     if int(model.geom_type[g]) not in KINDS:
       raise ValueError(
