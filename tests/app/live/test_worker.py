@@ -181,7 +181,7 @@ def the_left_hand_moves_its_instrument_alone(one):
   moved = np.zeros(one.scene["bodies"])
   while moved.max() < 0.01:
     moved = np.linalg.norm(places(one.hear("frame")) - places(first), axis=1)
-  assert np.linalg.norm(one.tip() - first[one.place]) < 1e-3  # the right one stays
+  assert np.linalg.norm(one.tip() - first[one.place]) < 2e-3  # the right one stays, but stirred
 
 
 def test_the_clock_starts_with_the_first_movement(page):
