@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from palpate.engine.model.flexes import matrix
 
 from . import trocar as ports
 from . import wrist
@@ -152,7 +153,7 @@ class Tip:
     """Sets the pose; arguments as of `Handle.move`, velocities are not used."""
     self.pos, self.quat = np.array(pos), self.quat if quat is None else np.array(quat)
     roll = float(self._ctrl[self._drives[2]])
-    self._ctrl[self._drives] = wrist.inverse(self.port, self.pos, ports.matrix(self.quat), roll)
+    self._ctrl[self._drives] = wrist.inverse(self.port, self.pos, matrix(self.quat), roll)
 
   def wrench(self) -> tuple[float, float, float, float, float, float]:
     """Returns zeros, see `Handle.wrench`."""

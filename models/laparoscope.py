@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from palpate.engine.model.flexes import matrix
 
-from .trocar import Trocar, about, forward, inverse, matrix
+from .trocar import Trocar, about, forward, inverse
 
 NAME = "laparoscope"
 OPTICS = math.radians(30.0)

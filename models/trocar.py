@@ -17,6 +17,7 @@ import pathlib
 
 import mujoco
 import numpy as np
+from palpate.engine.model.flexes import matrix
 from palpate.tissue.reading import choices
 
 NAMES = ("probe", "grasper", "scissors", "hook", "scalpel", "laparoscope")
@@ -189,13 +190,6 @@ def orientation(mat: np.ndarray) -> np.ndarray:
   quat = np.zeros(4)
   mujoco.mju_mat2Quat(quat, np.ascontiguousarray(mat).ravel())
   return quat
-
-
-def matrix(quat) -> np.ndarray:
-  """Returns the matrix of a quaternion, w x y z."""
-  mat = np.zeros(9)
-  mujoco.mju_quat2Mat(mat, np.asarray(quat, float))
-  return mat.reshape(3, 3)
 
 
 def about(axis: int, angle: float) -> np.ndarray:

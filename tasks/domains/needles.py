@@ -10,6 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from palpate.engine.model.flexes import matrix
 from palpate.models import trocar, wrist
 
 from ..core.base import Task
@@ -164,7 +165,7 @@ def about(axis: int, angle: float) -> np.ndarray:
   """Returns the rotation about an axis by an angle [rad]."""
   quat = np.zeros(4)
   mujoco.mju_axisAngle2Quat(quat, np.eye(3)[axis], angle)
-  return trocar.matrix(quat)
+  return matrix(quat)
 
 
 def between(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
@@ -175,7 +176,7 @@ def between(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
   if angle < 1e-9:
     return b
   mujoco.mju_axisAngle2Quat(quat, spin / angle, t * angle)
-  return a @ trocar.matrix(quat)
+  return a @ matrix(quat)
 
 
 def apart(a: np.ndarray, b: np.ndarray) -> float:
@@ -222,7 +223,7 @@ def carry(p: Performer, path: Callable[[float], Pose], angle: float | None = Non
     angle: that it turns by on the way [rad]; None to go to the end in a line
   """
   pos, mat = needle(p.physics)
-  held, frame = mat.T @ (p.hand.tip_pos() - pos), mat.T @ trocar.matrix(p.hand.tip_quat())
+  held, frame = mat.T @ (p.hand.tip_pos() - pos), mat.T @ matrix(p.hand.tip_quat())
   end, turn = path(1.0)
   for t in p.shares(_steps(p, end - pos, apart(mat, turn) if angle is None else abs(angle))):
     if angle is None:

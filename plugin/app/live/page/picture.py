@@ -14,6 +14,7 @@ import mujoco as mj
 import numpy as np
 import trimesh
 from palpate import Organ, Thread
+from palpate.engine.model.flexes import matrix
 from palpate.models.situs import LIGHT
 from palpate.organ import instances
 from palpate.tissue.geometry import subdivide
@@ -319,9 +320,7 @@ def _shape(model: mj.MjModel, geoms: Sequence[int]) -> dict[str, Any]:
   vertices, triangles, count = [], [], 0
   for g in geoms:
     x, t = _geom(model, g)
-    turn = np.zeros(9)
-    mj.mju_quat2Mat(turn, model.geom_quat[g])
-    vertices.append(x @ turn.reshape(3, 3).T + model.geom_pos[g])
+    vertices.append(x @ matrix(model.geom_quat[g]).T + model.geom_pos[g])
     triangles.append(t + count)
     count += len(x)
   return {"vertices": pack(np.concatenate(vertices)), "triangles": pack(np.concatenate(triangles))}
@@ -392,9 +391,8 @@ def _skin(model: mj.MjModel, data: mj.MjData, skin: int) -> dict[str, Any]:
   first, count = int(model.skin_vertadr[skin]), int(model.skin_vertnum[skin])
   face, faces = int(model.skin_faceadr[skin]), int(model.skin_facenum[skin])
   bone = int(model.skin_boneadr[skin])
-  body, bind = int(model.skin_bonebodyid[bone]), np.zeros(9)
-  mj.mju_quat2Mat(bind, model.skin_bonebindquat[bone].astype(float))
-  own = (model.skin_vert[first : first + count] - model.skin_bonebindpos[bone]) @ bind.reshape(3, 3)
+  body, bind = int(model.skin_bonebodyid[bone]), matrix(model.skin_bonebindquat[bone])
+  own = (model.skin_vert[first : first + count] - model.skin_bonebindpos[bone]) @ bind
   at = int(model.skin_texcoordadr[skin])
   return {
     "vertices": pack(own @ data.xmat[body].reshape(3, 3).T + data.xpos[body]),
