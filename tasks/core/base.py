@@ -96,6 +96,7 @@ class Task(engine.Task):
 
   name = "task"
   rules: Any = None  # see `Rules`
+  settles = stage.SETTLES  # see `stage.build` [s]
   slots = 12  # nodes that the instrument touches at once, and some more: slots of a GPU's window
   watch = ("miss", "unintended_contact")
   final: tuple[str, ...] = ()  # components that end the episode above 0.5
@@ -241,7 +242,7 @@ class Task(engine.Task):
     hands = [prefix for prefix in (self.prefix, self.second) if prefix]
     for prefix in hands:
       check_scene(model, prefix, self.targets, self.organ, self.scene.handle)
-    return stage.build(model, hands, self.organ)
+    return stage.build(model, hands, self.organ, self.settles)
 
   def _scene(self, variant: int | None) -> Scene:
     return dataclasses.replace(self.scene, variant=variant, targets=self.targets)

@@ -259,7 +259,8 @@ def furnish(
     organ: flexcomp of the organ
     center: what port and camera are from [m]  (3,)
     bed: what is in the body that the organ is bonded to
-    slots: of the organ's window, None for what experts touch
+    slots: of the organ's window; None for what experts touch, 0 for no window: what has no geoms,
+      such as a thread, meets it everywhere
   """
   spec = mujoco.MjSpec.from_string(_xml(organ, center, scene, bed))
   hands = (scene.instrument, scene.port), (scene.second, scene.second_port)
@@ -269,9 +270,11 @@ def furnish(
       _look(spec, scene, center)
     elif name:
       trocar.attach(spec, name, prefix, port, trocar.aim(port, center), scene.handle)
-  touched = sum(_SLOTS[name] for name in (scene.instrument, scene.second) if name)
-  slots = slots or touched * max(1, -(-scene.nodes // 1000))
-  palpate.add_windows(spec, ORGAN, nodes=slots)
+  if slots is None:
+    touched = sum(_SLOTS[name] for name in (scene.instrument, scene.second) if name)
+    slots = touched * max(1, -(-scene.nodes // 1000))
+  if slots:
+    palpate.add_windows(spec, ORGAN, nodes=slots)
   return spec
 
 

@@ -14,9 +14,9 @@ from palpate.models import handle, trocar
 from palpate.tissue.config import Config
 
 STATE = mj.mjtState.mjSTATE_INTEGRATION
-# An organ is at rest when its fastest node is slower than so much [m/s]; it is waited for so long,
-# and looked at so often [s].
-_STILL, _SETTLE, _LOOK = 1e-7, 3.0, 0.1
+SETTLES = 3.0  # how long an organ is waited for [s]
+# It is at rest when its fastest node is slower than so much [m/s]; it is looked at so often [s].
+_STILL, _LOOK = 1e-7, 0.1
 # What an episode may change in the model.
 _CHANGED = (
   "body_pos",
@@ -71,18 +71,23 @@ def compile_spec(spec: mj.MjSpec) -> mj.MjModel:
     return spec.compile()
 
 
-def build(model: mj.MjModel, hands: Sequence[str], organ: str) -> Stage:
-  """Returns the stage of a model, with an organ and the instruments of these prefixes."""
+def build(
+  model: mj.MjModel, hands: Sequence[str], organ: str, settles: float = SETTLES
+) -> Stage:
+  """Returns the stage of a model, with an organ and the instruments of these prefixes.
+
+  It is waited for the organ to come to rest, but no longer than `settles` [s].
+  """
   data = mj.MjData(model)
   tissue = Organ(model, data, organ)
-  settle(tissue, hands)
+  settle(tissue, hands, settles)
   state = np.empty(mj.mj_stateSize(model, STATE))
   mj.mj_getState(model, data, state, STATE)
   nominal = {name: operator.attrgetter(name)(model).copy() for name in _CHANGED}
   return Stage(model, state, tissue.config, nominal)
 
 
-def settle(organ: Organ, hands: Sequence[str]) -> None:
+def settle(organ: Organ, hands: Sequence[str], most: float = SETTLES) -> None:
   """Lets the organ come to rest under its weight, instruments withdrawn; time starts anew."""
   model, data = organ.model, organ.data
   for prefix in hands:
@@ -95,7 +100,7 @@ def settle(organ: Organ, hands: Sequence[str]) -> None:
     else:
       port = trocar.trocar(model, prefix)
       held.move(trocar.forward(port, (0.0, 0.0, low)))
-  for _ in range(round(_SETTLE / _LOOK)):
+  for _ in range(round(most / _LOOK)):
     mj.mj_step(model, data, round(_LOOK / model.opt.timestep))
     if np.linalg.norm(organ.xvel, axis=1).max() < _STILL:
       break

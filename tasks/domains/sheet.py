@@ -85,18 +85,24 @@ def stretched(
     radius=_SKIN,
     rgba=_COLOUR,
   )
-  inside = scene.surroundings == "abdomen"
-  spec = scenes.furnish(scene, flex, np.zeros(3), _frame(seen=not inside), slots)
+  bars = _frame(seen=scene.surroundings != "abdomen")
+  spec = scenes.furnish(scene, flex, np.zeros(3), bars, slots)
   if spare:
     palpate.add_spare(spec, scenes.ORGAN, round(spare * np.sqrt(len(vertices))))
-  if inside:
+  if scene.surroundings == "abdomen":
     situs.dress(spec, scenes.ORGAN, "wall", vertices[:, :2] / 0.15)
+  lie_in_fat(spec, scene)
+  return spec
+
+
+def lie_in_fat(spec: mujoco.MjSpec, scene: Scene) -> None:
+  """Puts fat under the organ and around it, and the abdomen around that."""
+  if scene.surroundings == "abdomen":
     situs.draw(spec, "abdomen_border", _border(), situs.paint(spec, "fat"))
     situs.furnish(spec, (), arrangement=_HELD)
     situs.light(spec, scene.camera, np.zeros(3))
   if scene.surroundings != "none":
     situs.obstruct(spec, (), arrangement=_HELD, more=_border(12, 37))
-  return spec
 
 
 def _frame(seen: bool) -> str:

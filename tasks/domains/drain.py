@@ -1,0 +1,134 @@
+"""The scene of `knot` and `extracorporeal`: a slit Penrose drain, and a thread through its marks.
+
+World: z is up, the drain lies on a block along y, and its slit is on top of it. A thread goes in
+through the mark at +x and out at -x, below the slit, along a chord of the drain: straight.
+"""
+
+import functools
+
+import mujoco
+import numpy as np
+import palpate
+from palpate.models import mjcf
+
+from ..core import scenes
+from ..core.scenes import BED, ORGAN, Scene
+from . import sheet
+from .needles import RADIUS as CIRCLE
+
+THREAD = "thread"
+WIDE, HIGH, LONG = 0.0074, 0.0054, 0.028  # of a tube of 1/4 inch that lies flat [m]
+DEEP = 0.00085  # of the thread below the top [m]
+SLIT, GAPE = 0.0084, 0.0024  # of the slit: length, and how far it gapes in its middle [m]
+MIDDLE = np.array([0.0, 0.0, HIGH - DEEP])  # of the stitch [m]
+BITE = WIDE * float(np.sqrt(1.0 - (1.0 - 2.0 * DEEP / HIGH) ** 2))  # between the marks [m]
+# Latex: 1 MPa is what rubbers of gloves and drains have at small strain; the wall is measured.
+# Thread of silk sticks in it: friction and toughness are ours.
+LATEX = {"young": 1e6, "thickness": 0.0005, "damping": 0.003}
+TOUGH, FRICTION = 4000.0, 600.0  # [J/m^2], [N/m]
+MASS = 0.0003  # of the tube, 1000 kg/m^3 [kg]
+# Hook and loop under it: some 30 kPa hold it [N/m^3, Pa, J/m^2].
+HELD = (1e8, 3e4, 60.0)
+_SKIN, _MARGIN = 2.5e-4, 6e-4  # radius of the flex; of the thread's contacts, which come early [m]
+_RGBA, _BLOCK = (0.86, 0.72, 0.42, 1.0), (0.022, 0.02, 0.003)
+HANDS, BLOCK = 8, 16  # bits of what meets instruments: the thread, and the block under the drain
+_SAMPLES = 4001  # of a section
+SETTLES = 0.1  # see `Task`: the thread falls meanwhile, until it is laid [s]
+
+
+@functools.lru_cache(maxsize=8)
+def drain(nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Returns the drain of about so many nodes, its bottom in z = 0.
+
+  Returns:
+    vertices [m] (nvert, 3), triangles (nelem, 3), and the vertices of both lips, those in front of
+    each other side by side (n, 2)
+  """
+  turn = np.linspace(0.0, 2.0 * np.pi, _SAMPLES)
+  section = np.stack([0.5 * WIDE * np.sin(turn), 0.5 * HIGH * (1.0 + np.cos(turn))], axis=1)
+  along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(section, axis=0), axis=1))]
+  around = 2 * round(0.5 * np.sqrt(nodes * along[-1] / LONG))
+  rows = 2 * round(0.5 * nodes / around) + 1  # one of them in the slit's middle
+  vertices, lips = [], []
+  number = np.zeros((rows, around + 1), int)
+  for j, y in enumerate(np.linspace(-0.5 * LONG, 0.5 * LONG, rows)):
+    off = 0.5 * GAPE * max(0.0, 1.0 - (2.0 * y / SLIT) ** 2)
+    for k in range(around + (off > 0.0)):
+      at = off + (along[-1] - 2.0 * off) * k / around
+      number[j, k] = len(vertices)
+      vertices.append([np.interp(at, along, section[:, 0]), y, np.interp(at, along, section[:, 1])])
+    if off > 0.0:
+      lips.append([number[j, 0], number[j, around]])
+    else:
+      number[j, around] = number[j, 0]
+  j, k = (i.ravel() for i in np.meshgrid(range(rows - 1), range(around), indexing="ij"))
+  a, b, c, d = number[j, k], number[j, k + 1], number[j + 1, k + 1], number[j + 1, k]
+  even = ((j + k) % 2 == 0)[:, None]
+  first = np.where(even, np.stack([a, b, d], 1), np.stack([a, c, d], 1))
+  second = np.where(even, np.stack([b, c, d], 1), np.stack([a, b, c], 1))
+  return np.array(vertices), np.concatenate([first, second]), np.array(lips)
+
+
+def build(scene: Scene, line: np.ndarray, meets: int = HANDS, **thread) -> mujoco.MjSpec:
+  """Returns the drain on its block with a thread, instruments, light and what is around.
+
+  The needle has been cut off the thread. The organ still knows the thread by it: see `sew`.
+
+  Args:
+    scene: what it plays in; its organ has about so many nodes
+    line: the thread's nodes, from where the needle was to the other end [m]  (n, 3)
+    meets: bits of what the thread meets: `HANDS` the instruments, 1 the drain
+    **thread: see `palpate.add_thread`
+  """
+  vertices, triangles, _ = drain(scene.nodes)
+  foot = np.flatnonzero(vertices[:, 2] < 0.1 * HIGH)
+  law = f"{BED} {mjcf.numbers(HELD)} at {' '.join(map(str, foot))}"
+  tissue = LATEX | {"needles": f"needle {TOUGH:g} {FRICTION:g}", "bonds": law}
+  flex = mjcf.flexcomp(
+    ORGAN,
+    (vertices, triangles),
+    config=tissue | {"device": "cpu", "tolerance": scenes.TOLERANCE},
+    contact=scenes.CONTACT,
+    digits=7,
+    mass=MASS,
+    radius=_SKIN,
+    rgba=_RGBA,
+  )
+  block = mjcf.tag("geom", {
+    "type": "box", "size": np.array(_BLOCK), "pos": np.array([0.0, 0.0, -_BLOCK[2]]),
+    "rgba": "0.25 0.4 0.6 1", "contype": 0, "conaffinity": BLOCK, "mass": 0,
+  })  # fmt: skip
+  spec = scenes.furnish(scene, flex, MIDDLE, block, slots=0)
+  sheet.lie_in_fat(spec, scene)
+  for geom in spec.geoms:
+    if geom.parent.name.startswith(tuple(filter(None, scene.prefixes))) and geom.contype & 1:
+      geom.contype, geom.conaffinity = geom.contype | BLOCK | HANDS, geom.conaffinity | HANDS
+  contact = {"contype": meets, "conaffinity": meets, "margin": _MARGIN}
+  palpate.add_thread(spec, line, THREAD, contact=contact, **thread)
+  aside = spec.worldbody.add_body(name="needle_holder")
+  palpate.add_needle(
+    spec, parent=aside, thread=THREAD, pos=line[0] + (0.0, CIRCLE, 0.0),
+    contact={"contype": 0, "conaffinity": 0}, rgba=(0, 0, 0, 0),
+  )  # fmt: skip
+  spec.equality(f"needle_{THREAD}").active = False
+  return spec
+
+
+def sew(organ: palpate.Organ, line: np.ndarray) -> palpate.Thread:
+  """Lays the thread along a line through the marks, see `build`, and returns it."""
+  thread = palpate.Thread(organ.model, organ.data, THREAD)
+  thread.lay(line)
+  organ.sew("needle")
+  return thread
+
+
+def gap(places: np.ndarray, nodes: int) -> float:
+  """Returns how far the slit gapes at most beside the stitch, 0 where its lips overlap [m].
+
+  Args:
+    places: of the drain's vertices now [m]  (nvert, 3)
+    nodes: that it was made with, see `drain`
+  """
+  rest, _, lips = drain(nodes)
+  right, left = lips[np.abs(rest[lips[:, 0], 1]) < 0.25 * SLIT].T
+  return float((places[right, 0] - places[left, 0]).max(initial=0.0))

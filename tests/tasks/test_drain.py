@@ -1,0 +1,34 @@
+"""The slit drain: its mesh, its foot, and the thread through its marks."""
+
+import mujoco
+import numpy as np
+import palpate
+import pytest
+from palpate.tasks.core import stage
+from palpate.tasks.core.scenes import Scene
+from palpate.tasks.domains import drain
+
+NODES = 150
+
+
+def test_a_drain_with_a_slit_has_a_thread_through_its_marks():
+  vertices, triangles, lips = drain.drain(NODES)
+  edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+  _, count = np.unique(edges, axis=0, return_counts=True)
+  around = np.count_nonzero(np.isclose(vertices[:, 1], drain.LONG / 2))
+  assert np.count_nonzero(count == 1) == 2 * around + 2 * (len(lips) + 1)  # both ends and the slit
+  normal = np.cross(*(vertices[triangles[:, k]] - vertices[triangles[:, 0]] for k in (1, 2)))
+  out = vertices[triangles].mean(axis=1) - (0, 0, drain.HIGH / 2)
+  assert ((normal * out)[:, [0, 2]].sum(axis=1) > 0).all()
+  line = drain.MIDDLE + np.linspace(-0.03, 0.02, 80)[:, None] * (1, 0, 0)
+  spec = drain.build(Scene(instrument="psm", nodes=NODES, surroundings="none"), line)
+  model = stage.compile_spec(spec)
+  data = mujoco.MjData(model)
+  organ = palpate.Organ(model, data, "organ")
+  thread = drain.sew(organ, line)
+  mujoco.mj_step(model, data, 50)
+  assert organ.error is None and thread.error is None
+  first, second = organ.pinholes
+  assert first.at[0] - second.at[0] == pytest.approx(drain.BITE, rel=0.05)  # of a polygon
+  assert drain.gap(organ.xpos, NODES) == pytest.approx(drain.GAPE, rel=0.02)
+  assert organ.bonds.share_freed == 0
