@@ -123,7 +123,7 @@ def test_what_is_said_is_in_the_table_of_words():
   texts = pathlib.Path(str(page.__file__)).with_name("texts.js")
   german = texts.read_text().partition("const ENGLISH")[0]
   words = dict(re.findall(r'"((?:[^"\\]|\\.)*)":\s*"((?:[^"\\]|\\.)*)"', german))
-  names = [name for pair in suite.ALL_TASKS for name in pair]
+  names = [word for domain, level in suite.ALL_TASKS for word in (f"{domain}/", *level.split("_"))]
   said = [re.sub(r"\d+(\.\d+)?", "#", suite.summary(*pair)) for pair in suite.ALL_TASKS]
   said += [*names, *(spec.label for spec in METRICS.values()), *ADVICE.values()]
   assert not {text for text in said if text not in words}

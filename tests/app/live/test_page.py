@@ -25,6 +25,26 @@ WATCH = """(() => {
   const look = () => seen.add(`${stage.dataset.warning}`).add(`tone ${body.dataset.tone}`);
   for (const each of [stage, body]) new MutationObserver(look).observe(each, {attributes: true});
 })()"""
+# Pairs of things on the page that overlap, and what is partly outside it.
+OVERLAP = """(() => {
+  const found = [], over = "#stage p:not(:empty), #stage button";
+  const seen = [...document.querySelectorAll(`${over}, header button, header label, aside h2`)]
+    .filter(each => each.getClientRects().length && !each.closest("#more:not([open])"));
+  const name = each => each.id || each.dataset.t || each.textContent;
+  seen.forEach((one, i) => {
+    const a = one.getBoundingClientRect(), {innerWidth: w, innerHeight: h} = window;
+    const out = a.left < -1 || a.right > w + 1 || !one.closest("aside") && a.bottom > h + 1;
+    if (out) found.push(`${name(one)} is outside`);
+    for (const other of seen.slice(i + 1)) {
+      const b = other.getBoundingClientRect();
+      const wide = Math.min(a.right, b.right) - Math.max(a.left, b.left);
+      if (wide > 2 && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 2) {
+        found.push(`${name(one)}, ${name(other)}`);
+      }
+    }
+  });
+  return found;
+})()"""
 # A gamepad that a test moves.
 PAD = "window.pads = []; navigator.getGamepads = () => window.pads;"
 
@@ -87,6 +107,9 @@ class Pages:
     self.page.click("#start")
     self.page.wait_for_selector("#stop:enabled", timeout=1e3 * ANSWER)
     self.until("window.palpate().head.steps >= 0", "no picture")
+    self.page.wait_for_timeout(200)
+    head, practice = self.page.evaluate("[window.palpate().head, window.palpate().scene.practice]")
+    assert practice or head["time"] == 0.0, "nobody has moved"
     self.page.focus("#view")
     for down in (True, False):  # the clock starts with a movement
       (self.page.keyboard.down if down else self.page.keyboard.up)("z")
@@ -291,6 +314,30 @@ def test_too_much_force_and_a_lost_tip_are_seen_and_heard(pages):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_nothing_overlaps_on_phones_and_tablets(pages, language):
+  """With every line of words, and the buttons that a moved camera adds."""
+  page = pages.page
+  page.evaluate("document.body.classList.add('touch')")
+  page.select_option("#language", language, force=True)
+  pages.start()
+  page.click("#scope")
+  words = "Too much force: 0.9 N, expected at most 0.4 N, and something that takes two lines"
+  page.evaluate("""text => {
+    for (const id of ["warning", "fault"]) document.getElementById(id).textContent = text;
+  }""", words)  # fmt: skip
+  for width, height in ((360, 740), (390, 844), (768, 1024), (1024, 768), (844, 390)):
+    page.set_viewport_size({"width": width, "height": height})
+    page.wait_for_timeout(150)
+    assert page.evaluate(OVERLAP) == [], (width, height)
+  page.set_viewport_size({"width": 900, "height": 600})
+  page.click("#scope")
+  page.evaluate("document.body.classList.remove('touch')")
+  page.select_option("#language", "en", force=True)
+  pages.stop()
+
+
+@pytest.mark.slow
 def test_an_assessment_is_without_help(pages):
   page = pages.page
   page.check("#assessment")
@@ -393,3 +440,12 @@ def test_a_program_that_ends_is_named_and_found_again(pages):
   pages.serve(pages.server.port)
   pages.page.wait_for_selector("#start:enabled", timeout=1e3 * ANSWER)
   assert pages.page.inner_text("#fault") == ""
+
+
+@pytest.mark.slow
+def test_an_exercise_that_is_not_there_is_named(pages):
+  pages.page.goto(f"{pages.server.url}#task=touch/nothing")
+  pages.page.reload()
+  said = "document.querySelector('#home .fault').textContent.includes('touch/nothing')"
+  pages.until(said, "nothing said")
+  assert pages.page.is_visible("#home .fault")

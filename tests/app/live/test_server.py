@@ -148,7 +148,7 @@ def test_a_session_over_the_socket(serve, tmp_path):
     assert menu["tasks"]["touch/easy"] and 1000 in menu["nodes"]
     assert next(iter(menu["tasks"])) == "touch/easy"  # what a beginner begins with
     with socket(server) as other:
-      assert "all places are taken" in json.loads(other.recv(timeout=ANSWER))["text"]
+      assert "All places are taken" in json.loads(other.recv(timeout=ANSWER))["text"]
     for words, said in (
       ("{", "Expecting"),
       ("[1]", "message is '[1]'"),

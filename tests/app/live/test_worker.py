@@ -189,6 +189,9 @@ def test_the_clock_starts_with_the_first_movement(page):
   one.tell("start", task="touch/easy")
   one.hear("scene")
   assert one.value("state") == 0.0 and one.frame[0] == 0.0
+  still = [0.0] * 4  # a page tells all its hands how they are, before they move
+  for which in ("right", "scope"):
+    one.tell("hand", which=which, move=still, rate=still, buttons=[], jaw=0)
   time.sleep(0.5)
   assert not one.near.poll() or json.loads(one.near.recv_bytes()[1:])["type"] == "status"
   stir(one)

@@ -1,5 +1,5 @@
 // The home page: a card for each exercise, by domain, the easiest first.
-import {t} from "./texts.js";
+import {domain, level, t, title} from "./texts.js";
 
 const KEY = "palpate.done";
 
@@ -35,30 +35,35 @@ export function standing({tasks, locked, progress}) {
   return {states, next: names.find(task => states[task] === "open") ?? names.find(task => states[task] === "done")};
 }
 
-export function show(place, menu, start) {
-  const {states, next} = standing(menu), groups = new Map();
-  for (const task of Object.keys(menu.tasks)) {
-    const domain = task.split("/")[0];
-    if (!groups.has(domain)) groups.set(domain, []);
-    groups.get(domain).push(task);
+// Returns the exercises of each domain, by its name.
+export function groups({tasks}) {
+  const found = new Map();
+  for (const task of Object.keys(tasks)) {
+    const name = domain(task);
+    found.set(name, [...found.get(name) ?? [], task]);
   }
-  place.replaceChildren(...[...groups].map(([domain, tasks]) => {
+  return [...found];
+}
+
+export function show(place, menu, start) {
+  const {states, next} = standing(menu);
+  place.replaceChildren(...groups(menu).map(([name, tasks]) => {
     const row = make("div", "cards"), section = make("section", "domain");
     row.append(...tasks.map(task => {
       const card = make("button", `card ${states[task]}${task === next ? " next" : ""}`), picture = make("img", "");
       const after = menu.locked[task], mark = {proficient: "★ ", done: "✓ ", locked: "🔒 ", open: ""}[states[task]];
       const tried = menu.progress?.[task]?.tried ? t("{0} of {1} attempts proficient", menu.progress[task].good, menu.progress[task].tried) : "";
-      const status = after ? t("after {0}", after) : task === next ? `${mark}${t("next")}` : mark + t(states[task]);
+      const status = after ? t("after {0}", title(after)) : task === next ? `${mark}${t("next")}` : mark + t(states[task]);
       picture.src = `cards/${task.replace("/", "_")}.webp`;
       picture.alt = "";
       picture.loading = "lazy";
       card.dataset.task = task;
       card.disabled = Boolean(after);
-      card.append(picture, make("strong", "", t(task.split("/")[1])), make("span", "what", t(menu.tasks[task])), make("span", "status", status), make("span", "tried", tried));
+      card.append(picture, make("strong", "", level(task)), make("span", "status", status), make("span", "what", t(menu.tasks[task])), make("span", "tried", tried));
       card.onclick = () => start(task);
       return card;
     }));
-    section.append(make("h2", "", t(domain)), row);
+    section.append(make("h2", "", name), row);
     return section;
   }));
 }

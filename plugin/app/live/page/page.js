@@ -4,7 +4,7 @@ import {CLOCK, Hand} from "./hand.js";
 import * as home from "./home.js";
 import {Plot} from "./plots.js";
 import {speaker} from "./sounds.js";
-import {language, speak, t} from "./texts.js";
+import {language, speak, t, title} from "./texts.js";
 import {PRACTICE, Tutorial} from "./tutorial.js";
 import {parts, View} from "./view.js";
 
@@ -14,6 +14,7 @@ const MEAN = 0.3;  // over which steps are counted [s]
 const AGAIN = 2000;  // between tries to reach the program [ms]
 const WORDS = 100;  // between numbers in words, which are laid out anew [ms]
 const ENOUGH = 40, PROMPT = 0.9;  // frames to judge by whether most of them are drawn
+const SILENT = 5000;  // without a picture, until that is said [ms]
 const LONGEST = 100;  // that a picture lies behind what came [ms]
 const KEPT = 5000;  // of the times from hand to picture
 const TELL = 8;  // between looks at the hand [ms]
@@ -29,10 +30,12 @@ try {
 }
 let offer = null;  // of the program: exercises, devices, ...
 let tutorial = null;
+let said = null;  // about what runs
 let scene = null, frame = null, head = {}, rest = null, running = false, paused = false;
 let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble = "", warned = "", late = null;
 let last = null, arrived = 0, span = 0, mixed = null, pictured = 0;  // frames between which pictures lie [ms]
 let waited = false;  // for a movement
+let silent = "";  // what was said about a program that says nothing
 let turn = 0, told = 0, came = 0, shown = 0;
 const plots = {force: new Plot("force"), way: new Plot("way"), rate: new Plot("rate")};
 const ways = [], pictures = [];  // from hand to picture [ms]; when pictures were drawn
@@ -61,9 +64,11 @@ function connect() {
     setTimeout(connect, AGAIN);
   };
 }
-connect();
 const say = message => socket.readyState === WebSocket.OPEN && socket.send(JSON.stringify(message));
-const tell = text => $("fault").textContent = text;
+const tell = text => document.querySelectorAll(".fault").forEach(each => each.textContent = text);
+
+tell(t("Connecting to the program"));
+connect();
 
 const HEAR = {
   menu(menu) {
@@ -71,26 +76,25 @@ const HEAR = {
     tell("");
     const first = !offer;
     offer = menu;
-    const groups = Object.groupBy?.(Object.keys(menu.tasks), name => name.split("/")[0]) ?? {"": Object.keys(menu.tasks)};
-    keep("task", () => $("task").replaceChildren(...Object.entries(groups).map(([domain, names]) => {
+    keep("task", () => $("task").replaceChildren(...home.groups(menu).map(([domain, names]) => {
       const group = document.createElement("optgroup");
       group.label = domain;
       group.append(...names.map(name => {
         const after = menu.locked[name];
-        const option = new Option(`${name}: ${t(menu.tasks[name])}${after ? ` (${t("after {0}", after)})` : ""}`, name);
+        const option = new Option(`${name}: ${t(menu.tasks[name])}${after ? ` (${t("after {0}", title(after))})` : ""}`, name);
         option.disabled = Boolean(after);
         return option;
       }));
       return group;
     })));
-    fill("nodes", [["", t("default")], ...menu.nodes.map(n => [n, t("{0} nodes", n)])]);
+    fill("nodes", [["", t("default")], ...menu.nodes.map(n => [n, t(`${n} nodes`)])]);
     fill("speed", menu.speeds.map(s => [s, s === 1 ? t("real time") : t("{0} \u00d7 real time", s)]).reverse());
     fill("scale", [1, 0.5, 0.25, 2].map(s => [s, `${s} : 1`]));
     fill("device", menu.devices.map(name => [name, name === "page" ? t("mouse, touch, keys, gamepad") : name]));
     fill("holder", menu.devices.map(name => [name, name === "page" ? t("keys and buttons of this page") : name]));
     fill("left", menu.lefts.map(name => [name, t({"": "none", keyboard: "keyboard, on this page", pad: "gamepad, on this page"}[name] ?? name)]));
     for (const name of ["organ", "mesh", "scheme", "instrument"]) {
-      fill(name, menu[`${name === "mesh" ? "meshe" : name}s`].map(value => [value, value.replace("_", " ")]));
+      fill(name, menu[`${name === "mesh" ? "meshe" : name}s`].map(value => [value, t(value.replace("_", " "))]));
     }
     fill("step", menu.steps.map(value => [value, `${value} ms`]));
     if (!scene) [$("step").value, $("mesh").value] = [1, "1000 nodes"];
@@ -99,6 +103,7 @@ const HEAR = {
     if (wanted in menu.tasks && !(wanted in menu.locked)) $("task").value = wanted;
     else if (first || $("task").selectedOptions[0]?.disabled) $("task").value = next;
     if (first) mode(wanted in menu.tasks ? "exercise" : "home");
+    if (first && wanted && !(wanted in menu.tasks)) tell(t("The address asks for {0}: there is no such exercise", wanted));
     home.show($("cards"), menu, choose);
     if (menu.trainee) [$("person").value, $("person").disabled] = [menu.trainee, true];
     fill("on", menu.processors.map(name => [name, name]));
@@ -110,7 +115,7 @@ const HEAR = {
   loading({text, note}) {
     tell("");
     $("welcome").replaceChildren();
-    $("instruction").textContent = t(note ? "Loading {0}, which takes a minute or more" : "Loading {0}", text);
+    $("instruction").textContent = t(note ? "Loading {0}, which takes a minute or more" : "Loading {0}", offer.tasks[text] ? title(text) : text);
   },
   scene(message) {
     scene = message;
@@ -136,7 +141,8 @@ const HEAR = {
     view.sew(message);
     rest = null;
   },
-  status({instruction, warning, kind, fault, scheme}) {
+  status(message) {
+    const {instruction, warning, kind, fault, scheme} = said = message;
     if (!tutorial) $("instruction").textContent = scene?.assessment ? t("Assessment: no help") : t(instruction);
     if (kind && kind !== warned) beep(kind);
     warned = kind;
@@ -163,7 +169,7 @@ const HEAR = {
     home.note($("task").value, message);
     const {next} = home.standing(offer), save = message.fault ? [[t("Save again"), () => say({type: "keep"})]] : [];
     const again = [t("Try again"), () => ($("card").close(), start())];
-    const on = message.done && next && next !== $("task").value ? [[t("Next: {0}", next), () => ($("card").close(), choose(next))]] : [];
+    const on = message.done && next && next !== $("task").value ? [[t("Next: {0}", title(next)), () => ($("card").close(), choose(next))]] : [];
     show($("card"), message, [...save, ...on, again, [t("Close"), () => $("card").close()]]);
     home.show($("cards"), offer, choose);
   },
@@ -175,9 +181,9 @@ const HEAR = {
     run(false);
   },
   error({text}) {
-    tell(text);
+    tell(t(text));
     if (!running && socket.readyState === WebSocket.OPEN) $("start").disabled = false;
-    if (text.startsWith("all places")) trouble = text;
+    if (text.startsWith("All places")) trouble = text;
     if (!trace) pressed("ghost", false);
   },
 };
@@ -287,6 +293,7 @@ function take(numbers) {
   [last, frame, span, arrived] = [frame, numbers, Math.min(now - arrived, LONGEST), now];
   fresh = true;
   came++;
+  if (silent) tell(silent = "");
   rest ??= nodes.slice();
   const {force_limit: limit} = scene;
   plots.force.push(head.force);
@@ -314,6 +321,8 @@ function take(numbers) {
     const [share, far] = view.line.measure(head);
     $("instruction").textContent = t("The line: {0} % followed, {1} mm off on average", Math.round(100 * share), (1e3 * far).toFixed(1));
   }
+  $("force").setAttribute("aria-valuemax", most.toFixed(2));
+  $("force").setAttribute("aria-valuenow", head.force.toFixed(2));
   $("force-text").textContent = t("{0} N, limit {1} N", head.force.toFixed(2), limit);
   $("progress").value = done;
   $("progress-text").textContent = `${Math.round(100 * done)} %`;
@@ -358,6 +367,15 @@ function targets() {
 
 const hear = () => running && hand.say().forEach(say);
 setInterval(hear, TELL);  // pictures may be further apart
+
+// A program that says nothing is named, where it should move.
+setInterval(() => {
+  if (!running || paused || STATES[head.state] !== "ready") return;
+  const passed = performance.now() - arrived;
+  if (passed > SILENT) tell(silent = t("No picture from the program for {0} s", Math.round(passed / 1e3)));
+}, 1000);
+$("view").addEventListener("webglcontextlost", () => tell(t("The graphics card has dropped the picture")));
+$("view").addEventListener("webglcontextrestored", () => tell(""));
 
 function draw() {
   requestAnimationFrame(draw);
@@ -439,6 +457,7 @@ $("language").value = language();
 $("language").onchange = () => {
   speak($("language").value);
   HEAR.menu(offer);
+  if (running && said) HEAR.status(said);
   $("pause").textContent = t(paused ? "Resume" : "Pause");
 };
 $("start").onclick = start;
@@ -465,4 +484,9 @@ $("view").addEventListener("keydown", event => {
   if (event.key === "y" && !$("scope").hidden) $("scope").click();
 });
 document.addEventListener("pointerdown", event => $("more").contains(event.target) || ($("more").open = false));
+$("more").addEventListener("keydown", event => {
+  if (event.key !== "Escape") return;
+  $("more").open = false;
+  $("more").firstElementChild.focus();
+});
 if (matchMedia("(pointer: coarse)").matches) document.body.classList.add("touch");

@@ -125,7 +125,7 @@ class Server:
     """Connects a page with a process of its own, in a thread of its own."""
     # A page that is loaded again comes before its former self has kept its recording and gone.
     if not self._places.acquire(timeout=_PATIENCE):
-      socket.send(json.dumps({"type": "error", "text": "all places are taken; close another page"}))
+      socket.send(json.dumps({"type": "error", "text": "All places are taken; close another page"}))
       socket.close(1013)
       return
     self._open.add(socket)

@@ -23,15 +23,16 @@ const GERMAN = {
     "Laparoskop: I J K L bewegen es im Bild, U hinein und O heraus, N und M drehen die Optik, V und B die Kamera. Mit F folgt es der Spitze. Mit Y, oder Kamera, bewegt alles Obige das Laparoskop.",
   "Free view: drag to rotate the picture. Two fingers, or Shift and drag, pan it. The wheel or a pinch zooms. Keys and gamepad still move the instrument.":
     "Freie Sicht: ziehen dreht das Bild. Zwei Finger, oder Umschalt und ziehen, schieben es. Rad oder Spreizen vergrößert. Tasten und Gamepad bewegen weiter das Instrument.",
+  "own scene": "eigene Szene", "liver": "Leber", "liver inclusion": "Leber mit Einschluss", "gallbladder": "Gallenblase", "stomach": "Magen", "kidney": "Niere",
+  "probe": "Taststab", "grasper": "Greifer", "scissors": "Schere", "hook": "Haken", "scalpel": "Skalpell",
   // Home.
   "Begin with the tutorial": "Beginne mit der Einführung", "It teaches how your hand moves the instrument, without clock and limits.":
     "Sie zeigt, wie deine Hand das Instrument bewegt, ohne Uhr und Grenzen.",
   "next": "als Nächstes", "done": "geschafft", "proficient": "sicher", "open": "offen", "after {0}": "nach {0}", "{0} of {1} attempts proficient": "{0} von {1} Versuchen sicher",
-  "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate_easy": "Tasten, leicht", "palpate_standard": "Tasten, mittel", "palpate_hard": "Tasten, schwer",
-  "touch": "Berühren", "probe": "Drücken und Tasten", "trace": "Nachfahren", "grasp": "Greifen", "retract": "Weghalten", "tease": "Ablösen",
-  "dissect": "Abpräparieren", "cut": "Schneiden", "bimanual": "Mit zwei Händen", "navigate": "Kamera führen", "needle": "Nadel übergeben", "suture": "Nähen",
-  "drive_easy": "Durchstechen, leicht", "drive_standard": "Durchstechen, mittel", "drive_hard": "Durchstechen, schwer",
-  "transfer_easy": "Übergeben, leicht", "transfer_standard": "Übergeben, mittel", "transfer_hard": "Übergeben, schwer",
+  // Domains, and the words that levels are made of.
+  "touch/": "Berühren", "probe/": "Drücken und Tasten", "trace/": "Nachfahren", "grasp/": "Greifen", "retract/": "Weghalten", "tease/": "Ablösen",
+  "dissect/": "Abpräparieren", "cut/": "Schneiden", "bimanual/": "Mit zwei Händen", "navigate/": "Kamera führen", "needle/": "Nadel übergeben", "suture/": "Nähen",
+  "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate": "tasten", "drive": "durchstechen", "transfer": "übergeben",
   // What exercises ask for.
   "touch one point within # mm": "berühre einen Punkt auf # mm genau", "touch four points within # mm": "berühre vier Punkte auf # mm genau",
   "touch six points within # mm, on livers that vary": "berühre sechs Punkte auf # mm genau, auf wechselnden Lebern",
@@ -74,11 +75,14 @@ const GERMAN = {
   "Choose an exercise and press Start.": "Wähle eine Übung und drücke Start.",
   "Choose an organ and press Start. Every choice may be changed while it runs.": "Wähle ein Organ und drücke Start. Alles lässt sich ändern, während es läuft.",
   "No connection to the program. Recordings are kept. Connecting again": "Keine Verbindung zum Programm. Aufnahmen sind gesichert. Verbindet neu",
+  "Connecting to the program": "Verbindet mit dem Programm", "The address asks for {0}: there is no such exercise": "Die Adresse verlangt {0}: diese Übung gibt es nicht",
+  "All places are taken; close another page": "Alle Plätze sind besetzt; schließe eine andere Seite", "No picture from the program for {0} s": "Seit {0} s kein Bild vom Programm",
+  "The graphics card has dropped the picture": "Die Grafikkarte hat das Bild verloren",
   "Assessment: no help": "Prüfung: keine Hilfe", "The clock starts with your first movement": "Die Uhr beginnt mit deiner ersten Bewegung",
   "The clock is stopped; it goes on when you move": "Die Uhr steht; sie läuft weiter, wenn du dich bewegst",
   "Computing the expert's path. The clock is stopped": "Der Weg der Könnerin wird berechnet. Die Uhr steht",
   "waiting": "wartet", "clutch": "gekuppelt", "lost": "Gerät fehlt", "paused": "angehalten", "{0} N, limit {1} N": "{0} N, Grenze {1} N", "{0} of {1} s": "{0} von {1} s",
-  "real time": "Echtzeit", "{0} × real time": "{0} × Echtzeit", "default": "voreingestellt", "{0} nodes": "{0} Knoten", "none": "keines",
+  "real time": "Echtzeit", "{0} × real time": "{0} × Echtzeit", "default": "voreingestellt", "# nodes": "# Knoten", "none": "keines",
   "mouse, touch, keys, gamepad": "Maus, Finger, Tasten, Gamepad", "keyboard, on this page": "Tasten dieser Seite", "gamepad, on this page": "Gamepad dieser Seite",
   "{0} steps a second": "{0} Schritte je Sekunde", "{0} % on time": "{0} % pünktlich", "{0} of real time": "{0} der Echtzeit",
   "{0} pictures a second": "{0} Bilder je Sekunde", "hand to picture {0} ms": "Hand bis Bild {0} ms",
@@ -153,11 +157,8 @@ const GERMAN = {
   "look at the target from where the light shows its place, then touch": "sieh das Ziel an, wo das Licht seinen Ort zeigt, dann berühre es", "slow down in the bends of the line": "fahre langsamer in den Bögen der Linie",
 };
 const ENGLISH = {
-  "touch": "Touch", "probe": "Press and palpate", "trace": "Follow a line", "grasp": "Grasp and lift", "retract": "Hold aside", "tease": "Tease off",
-  "dissect": "Dissect", "cut": "Cut", "bimanual": "With two hands", "navigate": "Hold the camera", "needle": "Hand a needle over", "suture": "Suture", "easy": "Easy", "standard": "Standard", "hard": "Hard", "depth": "Depth",
-  "palpate_easy": "Palpate, easy", "palpate_standard": "Palpate, standard", "palpate_hard": "Palpate, hard",
-  "transfer_easy": "Transfer, easy", "transfer_standard": "Transfer, standard", "transfer_hard": "Transfer, hard",
-  "drive_easy": "Drive, easy", "drive_standard": "Drive, standard", "drive_hard": "Drive, hard",
+  "touch/": "Touch", "probe/": "Press and palpate", "trace/": "Follow a line", "grasp/": "Grasp and lift", "retract/": "Hold aside", "tease/": "Tease off",
+  "dissect/": "Dissect", "cut/": "Cut", "bimanual/": "With two hands", "navigate/": "Hold the camera", "needle/": "Hand a needle over", "suture/": "Suture",
 };
 export const LANGUAGES = {en: ENGLISH, de: GERMAN};
 
@@ -181,6 +182,12 @@ export function t(text, ...values) {
   return found.replace(/\{(\d)\}/g, (_, i) => values[i]);
 }
 const NUMBER = /\d+(\.\d+)?/g;
+
+// What a domain and an exercise of it are called: "Suture", "Drive, easy".
+const capital = text => text.charAt(0).toUpperCase() + text.slice(1);
+export const domain = task => capital(t(`${task.split("/")[0]}/`).replace("/", ""));
+export const level = task => capital(task.split("/")[1].split("_").map(word => t(word)).join(", "));
+export const title = task => `${domain(task)}: ${level(task)}`;
 
 // Puts the page itself into a language: texts, titles and labels that are marked as such.
 export function speak(name = language()) {

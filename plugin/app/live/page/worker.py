@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from typing import Any
@@ -98,8 +99,11 @@ class Worker:
       try:
         self._job = job
         self._exercise(job) if job["type"] == "start" else self._practise(job)
-      except (ValueError, TypeError, OSError, DeviceError, RuntimeError) as error:
-        self._fault(error)
+      except Exception as error:  # the page names whatever it is, and goes on
+        told = isinstance(error, (ValueError, OSError, DeviceError))
+        if not told:
+          traceback.print_exc()
+        self._fault(error if told else f"{type(error).__name__}: {error}")
         self._tell({"type": "idle"})
     if self._unkept is not None and (kept := self._keep(*self._unkept)).path is None:
       print(f"palpate: a recording is lost: {kept.fault}", file=sys.stderr)
@@ -146,10 +150,12 @@ class Worker:
 
   def _on_hand(self, message: dict[str, Any]) -> None:
     desk = self._desks.get(message.get("which", "right"))
-    if desk is not None:
-      if message.get("which") == "scope" and self._now is not None:
-        self._now.pace.waits = False  # a view is a movement too
-      desk.feed(**{k: message[k] for k in ("move", "rate", "buttons", "jaw", "at") if k in message})
+    if desk is None:
+      return
+    desk.feed(**{k: message[k] for k in ("move", "rate", "buttons", "jaw", "at") if k in message})
+    moves = any([*message.get("move", ()), *message.get("rate", ()), message.get("jaw")])
+    if message.get("which") == "scope" and moves and self._now is not None:
+      self._now.pace.waits = False  # a view is a movement too
 
   def _on_follow(self, message: dict[str, Any]) -> None:
     scope = self._now.scope if self._now is not None else None
