@@ -29,7 +29,7 @@ from .sight import PICTURES, Seeing
 
 HIDDEN = ("joint_vel", "drive", "tip_vel", "surface")  # from an actor that is taught
 ACTING, MORE = "acting", "more"  # groups of observations
-CHANGES = ("jaw", "head")  # components that an actor says as changes: jaws close by and by
+CHANGES = ("jaw", "head")  # ends of components that an actor says as changes: jaws close by and by
 POWER = 2.0  # an action is what the actor says times its size: slow motion is as clear as fast
 CLONING = 700  # steps of the optimiser of a round
 _BATCH, _RATE = 32, 3e-3  # lessons of a step
@@ -96,8 +96,8 @@ class Networks:
     self._memory: Any = None
     self._components = list(components)
     self._scaled: list[Any] = []  # networks that know how large observations are
-    self._changes = [name for name in components if name in CHANGES]
-    self._adds = torch.tensor([float(name in CHANGES) for name in components], device=device)
+    self._changes = [name for name in components if name.endswith(CHANGES)]
+    self._adds = torch.tensor([float(name.endswith(CHANGES)) for name in components], device=device)
     seen = TensorDict(
       {g: torch.zeros(1, self._width(names)) for g, names in self.groups.items()}, batch_size=[1]
     )
