@@ -206,6 +206,7 @@ class Worlds:
       s.cutter_inside, s.cutter_length, s.cutter_seat = found.inside, found.length, found.seat
       s.piece_count = organ.piece_count
     if s.needle_force.shape[1]:
+      self.batch.poses()  # by which holes tell how far along the needle they are
       found = organ.needles
       s.needle_force, s.hole_count = found.force, found.count
       s.hole_rest, s.hole_along = found.hole_rest, found.hole_along
