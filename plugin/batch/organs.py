@@ -26,7 +26,7 @@ from palpate.tissue.types import fill
 
 from . import bonds, host, kernels, needles, patch
 from .base import Contacts, Tissue, spread
-from .contact import contact_rows, contacts, convex
+from .contact import contact_rows, contacts, convex, edges
 from .cutting import blades
 from .cutting.cuts import Cuts
 from .cutting.fracture import Cutters
@@ -144,14 +144,14 @@ class Organ(Tissue):
     for thread in threads:
       f, origin = thread.fields, thread.declared.origin
       values = {"first": first, "now": f.now, "frame": f.frame, "origin": origin}
-      self._lines.append(fill(contacts.Line, self.body.device, values))
+      self._lines.append(fill(edges.Line, self.body.device, values))
       first += len(thread.declared.rest) - 1
 
   def _lay_lines(self):
     """Writes where the threads' edges are."""
     for line in self._lines:
       dim, device = (self.batch.nworld, line.now.shape[1] - 1), self.body.device
-      wp.launch(contacts.lay_lines, dim=dim, inputs=[self.patch, line], device=device)
+      wp.launch(edges.lay, dim=dim, inputs=[self.patch, line], device=device)
 
   def enclose(self):
     """Lets the step know volume stiffness and pressure, from the next record on."""
@@ -228,7 +228,7 @@ class Organ(Tissue):
     if self._lines:  # whose steps ask for it
       dim, device = (self.batch.nworld, p.nslot), self.body.device
       inputs = [p, self.batch.d.qacc_warmstart]
-      wp.launch(contacts.lead, dim=dim, inputs=inputs, device=device)
+      wp.launch(edges.lead, dim=dim, inputs=inputs, device=device)
     if not self.sews:
       self._scheme.step(self.body)
 

@@ -16,15 +16,14 @@ import warp as wp
 
 # All that depends on names inside of mujoco_warp: its tools against a triangle, and types.
 from palpate.engine import contacts
-from palpate.engine.layout import GEOM
 from palpate.engine.model import mjstruct
-from palpate.tissue.types import Array, doubles, fill, floats, ints, struct
+from palpate.tissue.types import Array, fill, floats, ints, struct
 
 from .. import private
 from ..kernels import triple
 from ..patch import Patch, halves
 from ..private import ContactType, vec5
-from . import convex, cylinder
+from . import convex, cylinder, triangle
 from .convex import Convex
 
 if TYPE_CHECKING:
@@ -45,8 +44,6 @@ KINDS = tuple(_EACH)  # of tools that a batch knows
 LINE = int(_GEOM.mjGEOM_LINE)  # an edge of a thread
 _SPHERE, _ELLIPSOID, _CAPSULE, _BOX, _PLANE = (wp.constant(kind) for kind in KINDS[:5])
 _CYLINDER, _MESH = KINDS[5:]
-_FAR = wp.constant(1e10)  # what mujoco_warp says of a contact that is none
-_POS, _AXIS = wp.constant(GEOM.pos), wp.constant(GEOM.axis)
 _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
 _LEAST = 1e-5  # friction, as in MuJoCo
 _HARD = (1.0, 1.0, 1.0, 0.5, 2.0)  # solimp; `sliding` makes contacts as soft as they are
@@ -106,16 +103,6 @@ class Touch:
   out_geomcollisionid: ints("naconmax")
 
 
-@struct
-class Line:
-  """A thread that an organ's slots follow."""
-
-  first: int  # number of its first edge among those of all
-  now: doubles("nworld", "nnode", 3)  # places of nodes in its frame [m]
-  frame: doubles(3, 3)  # rotation from that to the world
-  origin: doubles(3)  # of that [m]
-
-
 @wp.struct
 class Place:
   """A triangle before a tool, and where its contacts go."""
@@ -148,18 +135,6 @@ def _where(p: Patch, world: int, i: int):
 
 
 @wp.func
-def _axes(normal: wp.vec3):
-  """Returns the axes of a contact, its normal first."""
-  n = wp.normalize(normal)
-  side = wp.vec3(0.0, 1.0, 0.0)
-  if wp.abs(n[1]) >= 0.5:
-    side = wp.vec3(0.0, 0.0, 1.0)
-  t = wp.normalize(side - wp.dot(side, n) * n)
-  u = wp.cross(n, t)
-  return wp.mat33(n[0], n[1], n[2], t[0], t[1], t[2], u[0], u[1], u[2])
-
-
-@wp.func
 def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3):
   """Writes a contact, if it is one and there is room; returns how many there are then."""
   q = at.tool
@@ -169,7 +144,7 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
     k = at.first + n
     c.out_dist[k] = dist
     c.out_pos[k] = pos
-    c.out_frame[k] = _axes(normal)
+    c.out_frame[k] = triangle.axes(normal)
     c.out_includemargin[k] = c.margin[q]
     slide = c.slide[at.world, q]
     if c.whose[q] == _ORGAN:
@@ -210,113 +185,6 @@ def _pose(p: Patch, world: int, tool: int):
   return p.geom_xpos[world, geom], p.geom_xmat[world, geom]
 
 
-@wp.kernel(enable_backward=False)
-def lay_lines(p: Patch, f: Line):
-  """Writes where a thread's edges are."""
-  world, e = wp.tid()
-  a, b = wp.vec3d(), wp.vec3d()
-  for k in range(3):
-    for c in range(3):
-      a[k] += f.frame[k, c] * f.now[world, e, c]
-      b[k] += f.frame[k, c] * f.now[world, e + 1, c]
-  axis = wp.normalize(b - a)
-  side = wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
-  if wp.abs(axis[1]) >= wp.float64(0.5):
-    side = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
-  x = wp.normalize(wp.cross(side, axis))
-  y = wp.cross(axis, x)
-  middle = wp.vec3d(f.origin[0], f.origin[1], f.origin[2]) + wp.float64(0.5) * (a + b)
-  line = f.first + e
-  p.line_xpos[world, line] = wp.vec3(middle)
-  p.line_xmat[world, line] = wp.mat33(wp.matrix_from_cols(x, y, axis))
-  tool = p.ntool - p.nline + line
-  for k in range(3):
-    for c in range(3):
-      turn = p.frame[c, k]
-      if c == 0:
-        p.tool[world, tool, _POS + k] = wp.float64(0.0)
-        for r in range(3):
-          p.tool[world, tool, _AXIS + 3 * r + k] = wp.float64(0.0)
-      p.tool[world, tool, _POS + k] = p.tool[world, tool, _POS + k] + turn * (
-        middle[c] - p.origin[c]
-      )
-      p.tool[world, tool, _AXIS + k] = p.tool[world, tool, _AXIS + k] + turn * x[c]
-      p.tool[world, tool, _AXIS + 3 + k] = p.tool[world, tool, _AXIS + 3 + k] + turn * y[c]
-      p.tool[world, tool, _AXIS + 6 + k] = p.tool[world, tool, _AXIS + 6 + k] + turn * axis[c]
-
-
-@wp.kernel(enable_backward=False)
-def lead(p: Patch, accelerated: wp.array2d[float]):
-  """Gives slots the last acceleration of their nodes."""
-  world, k = wp.tid()
-  i = p.slot_node[world, k]
-  dof = p.dofadr + 3 * k
-  for r in range(3):
-    total = float(0.0)  # noqa: UP018 - a variable to Warp
-    if i >= 0:
-      for c in range(3):
-        total += float(p.frame[r, c] / p.h) * p.last[world, i // 8, c, i % 8]
-    accelerated[world, dof + r] = total
-
-
-@wp.func
-def _ellipsoid(pos: wp.vec3, rot: wp.mat33, size: wp.vec3, a: wp.vec3, b: wp.vec3, d: wp.vec3):
-  """Returns distance, place and normal of the point of a triangle that is nearest to an ellipsoid.
-
-  Nearest is meant in units of its half axes; the distance is that of `core/geom.h`.
-  """
-  t = wp.transpose(rot)
-  la = wp.cw_div(t * (a - pos), size)
-  lb = wp.cw_div(t * (b - pos), size)
-  ld = wp.cw_div(t * (d - pos), size)
-  dist, nearest, _normal = private.sphere_triangle(wp.vec3(0.0), 0.0, la, lb, ld, 0.0, _FAR)
-  k = wp.normalize(nearest) * wp.max(dist, 1e-6)
-  r = wp.length(k)
-  gradient = wp.cw_div(k, size)
-  e = wp.length(gradient)
-  where = pos + rot * wp.cw_mul(k, size)
-  return r * (r - 1.0) / wp.max(e, 1e-12), where, rot * wp.normalize(gradient)
-
-
-@wp.func
-def _between(p: wp.vec3, d: wp.vec3, q: wp.vec3, e: wp.vec3):
-  """Returns the nearest points of the segments from p along d and from q along e, and how far."""
-  r = p - q
-  dd, ee, de = wp.dot(d, d), wp.dot(e, e), wp.dot(d, e)
-  dr, er = wp.dot(d, r), wp.dot(e, r)
-  apart = dd * ee - de * de
-  s = float(0.5)  # noqa: UP018 - a variable to Warp
-  if apart > 1e-6 * dd * ee:
-    s = wp.clamp((de * er - dr * ee) / apart, 0.0, 1.0)
-  t = wp.clamp((de * s + er) / ee, 0.0, 1.0)
-  s = wp.clamp((de * t - dr) / dd, 0.0, 1.0)
-  x = p + s * d
-  y = q + t * e
-  return wp.length(y - x), x, y
-
-
-@wp.func
-def _line(
-  pos: wp.vec3, axis: wp.vec3, radius: float, half: float, a: wp.vec3, b: wp.vec3, d: wp.vec3,
-  skin: float, margin: float,
-):  # fmt: skip
-  """Returns distance, place and normal of the point of an edge that is nearest to a triangle."""
-  start = pos - half * axis
-  dist, x, normal = private.sphere_triangle(start, radius, a, b, d, skin, margin)
-  other, y, n = private.sphere_triangle(pos + half * axis, radius, a, b, d, skin, margin)
-  if other < dist:
-    dist, x, normal = other, y, n
-  for k in range(3):
-    corner = wp.where(k == 0, a, wp.where(k == 1, b, d))
-    along = wp.where(k == 0, b, wp.where(k == 1, d, a)) - corner
-    far, here, there = _between(start, 2.0 * half * axis, corner, along)
-    if far - radius - skin < dist and far > 1e-9:
-      dist = far - radius - skin
-      normal = (there - here) / far
-      x = here + (radius + 0.5 * dist) * normal
-  return dist, x, normal
-
-
 @functools.cache
 def _against(kinds: frozenset[int]):
   """Returns the function that finds a triangle's contacts with a tool of one of these kinds."""
@@ -337,7 +205,7 @@ def _against(kinds: frozenset[int]):
         n = _put(c, at, n, dist, x, normal)
     if wp.static(ellipsoid):
       if kind == _ELLIPSOID:
-        far, y, out = _ellipsoid(pos, rot, size, a, b, d)
+        far, y, out = triangle.ellipsoid(pos, rot, size, a, b, d)
         gap = far - c.radius
         n = _put(c, at, n, gap, y - (c.radius + 0.5 * gap) * out, out)
     if wp.static(capsule):
@@ -349,7 +217,7 @@ def _against(kinds: frozenset[int]):
           n = _put(c, at, n, dists[k], xs[k], normals[k])
     if wp.static(LINE in kinds):
       if kind == wp.static(LINE):
-        near, y5, n5 = _line(pos, axis, size[0], size[1], a, b, d, c.radius, margin)
+        near, y5, n5 = triangle.edge(pos, axis, size[0], size[1], a, b, d, c.radius, margin)
         n = _put(c, at, n, near, y5, n5)
     if wp.static(box):
       if kind == _BOX:
@@ -391,14 +259,6 @@ def _on_planes(p: Patch, c: Touch, at: Place, n: int, x: wp.vec3):
       gap = wp.dot(out, x - p.geom_xpos[at.world, at.geom]) - c.radius
       n = _put(c, at, n, gap, x - (c.radius + 0.5 * gap) * out, out)
   return n
-
-
-@wp.func
-def _ball(a: wp.vec3, b: wp.vec3, d: wp.vec3):
-  """Returns middle and radius of a ball about a triangle."""
-  centre = (a + b + d) / 3.0
-  far = wp.max(wp.length_sq(a - centre), wp.length_sq(b - centre))
-  return centre, wp.sqrt(wp.max(far, wp.length_sq(d - centre)))
 
 
 @wp.func
@@ -470,7 +330,7 @@ def kernel(kinds: frozenset[int], lifts: bool) -> wp.Kernel:
           xa = _where(p, world, va)
           xb = _where(p, world, vb)
           xd = _where(p, world, vd)
-          centre, around = _ball(xa, xb, xd)
+          centre, around = triangle.ball(xa, xb, xd)
           for tool in range(p.ntool):
             at.tool = tool
             at.geom = p.tool_geom[tool]
