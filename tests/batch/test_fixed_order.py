@@ -4,8 +4,9 @@ import mujoco
 import numpy as np
 import palpate.batch
 import pytest
+import warp as wp
 from devices import needs_cuda
-from palpate.batch.contact.fixed_order import FixedOrder, is_enough
+from palpate.batch.contact.fixed_order import FixedOrder, is_enough, sort_matches
 from scenes import probed
 
 ROWS = ("type", "id", "J_rownnz", "J_rowadr", "pos", "margin", "D", "vel", "aref", "frictionloss")
@@ -76,6 +77,27 @@ def test_rows_come_in_the_same_order_whoever_asked_first():
   assert not equal(rows(batch), first)
   order.sort()
   assert equal(rows(batch), first)
+
+
+def test_contacts_of_a_sensor_come_in_the_same_order_whoever_was_first():
+  """By the sensor's criterion, then by their places; ~ where its body is the second."""
+  random, most = np.random.RandomState(0), 16
+  for n in range(most):
+    places = random.permutation(40)[:n]
+    match = np.full(most, -1)
+    match[:n] = np.where(random.rand(n) < 0.5, places, ~places)
+    by = np.full(most, 1e32)
+    by[:n] = random.randint(3, size=n)
+    order = np.lexsort((places, by[:n]))
+    found, criterion = (
+      wp.array(values[None, None], dtype=kind, device="cpu")
+      for values, kind in ((match, int), (by, float))
+    )
+    sensor = [wp.zeros((1, 3), dtype=int, device="cpu"), wp.zeros(1, dtype=int, device="cpu")]
+    count = wp.array([[n]], dtype=int, device="cpu")
+    inputs = [*sensor, count, found, criterion, found]
+    wp.launch(sort_matches(most), dim=(1, 1, 1), inputs=inputs, device="cpu")
+    assert found.numpy()[0, 0, :n].tolist() == match[:n][order].tolist()
 
 
 @pytest.mark.parametrize("device", ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)])

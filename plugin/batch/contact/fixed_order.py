@@ -232,7 +232,7 @@ def _compensation(deterministic: bool) -> wp.Kernel:
 
 
 @functools.cache
-def _sort_matches(most: int) -> wp.Kernel:
+def sort_matches(most: int) -> wp.Kernel:
   """Returns the kernel that orders a sensor's contacts: by its criterion, then by their places."""
 
   @wp.func
@@ -250,7 +250,9 @@ def _sort_matches(most: int) -> wp.Kernel:
     if lane > 0:
       return
     for k in range(1, wp.min(count[w, s], wp.static(most))):
-      at, mine, own = k, match[w, s, k], criterion[w, s, k]
+      at = k
+      mine = match[w, s, k]  # a copy: of two at once Warp keeps where they are
+      own = criterion[w, s, k]
       while at > 0 and before(mine, match[w, s, wp.max(at - 1, 0)],
                               own, criterion[w, s, wp.max(at - 1, 0)]):  # fmt: skip
         match[w, s, at] = match[w, s, at - 1]
@@ -344,7 +346,7 @@ class FixedOrder:
       (solver, "_update_gradient_grad"): _gradient,
       (solver, "_update_constraint_init_qfrc_constraint_sparse"): _constraint_force,
       (private.passive, "_gravity_force"): _compensation,
-      (sensor, "_contact_sort"): _sort_matches,
+      (sensor, "_contact_sort"): sort_matches,
       (sensor, "_sensor_touch"): lambda deterministic: kept[sensor, "_sensor_touch"](True),
     }
     kept = {(module, name): getattr(module, name) for module, name in instead}
