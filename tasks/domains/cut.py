@@ -33,6 +33,7 @@ from ..core.rules import (
   FAR,
   HIDDEN,
   LATER,
+  NOW,
   RUNNING,
   SUCCESS,
   Rules,
@@ -69,6 +70,7 @@ CLOSING = 0.006  # length that is cut beyond that of the line where the piece co
 STEP = 0.001  # between points of the line [m]
 FIRST, SECOND, THIRD = 5, 10, 15  # points further on that are observed
 MARKS, ABOVE = 36, 0.0006  # spheres that draw the line, and how far above it [m]
+LEAD = 4  # of them that show where to begin or to go on, and which way
 LEAP = 10  # points of the line between two control steps that do not follow one another
 # Of the expert: how fast it cuts [m/s], and how deep the tip is under the sheet and over it [m].
 _SPEED, _DEEP, _OVER = 0.012, 0.0035, 0.012
@@ -257,7 +259,9 @@ def observe(s, o):
 def mark(s, o, k):
   """Marks the line where it is not cut: there are the lips of the cut."""
   at = k * o.count // MARKS
-  return o.curve[at] + vector(0.0, 0.0, ABOVE), HIDDEN if o.cut[at] > 0 else LATER
+  further = (at - o.next + o.count) % o.count
+  look = NOW if MARKS * further < LEAD * o.count else LATER
+  return o.curve[at] + vector(0.0, 0.0, ABOVE), HIDDEN if o.cut[at] > 0 else look
 
 
 class Cut(Task):

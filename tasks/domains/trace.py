@@ -60,6 +60,7 @@ DRAWN = 160  # points along the curve as it is drawn
 _ATTEMPTS = 40
 _FACING = 0.7  # least cosine between the surface's normal and the way to the trocar
 MARKS = 30  # spheres that draw the curve
+LEAD = 4  # of them that show where to begin or to go on, and which way: one is a pixel from afar
 
 
 @exercise("trace/easy", 20, "easy")
@@ -269,7 +270,7 @@ def marked(o, k):
 def mark(s, o, k):
   """Marks what is left of the curve, and where to begin or to go on."""
   at, first = marked(o, k), min(done(o), o.count - 1)
-  begins = at >= first and (k == 0 or marked(o, max(k - 1, 0)) < first)
+  begins = at >= first and (k < LEAD or marked(o, max(k - LEAD, 0)) < first)
   look = LATER if at >= first else HIDDEN
   return place(s, o, at), NOW if begins else look
 

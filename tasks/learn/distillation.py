@@ -27,10 +27,11 @@ from .sight import PICTURES
 
 TEACHER, PROGRESS = "teacher", "progress"  # groups of observations
 STEPS = 32  # control steps of an iteration
-UPDATES, WORLDS = 64, 32  # steps of the optimiser of an iteration, and worlds of each
+UPDATES, WORLDS = 128, 32  # steps of the optimiser of an iteration, and worlds of each
 _KEPT = 8  # iterations that are learned from
 _ALONE = 1 / 3  # share of worlds where the student acts alone, once it acts
 _TURN = 40  # control steps of a turn elsewhere, in the mean
+_STUCK = 40  # control steps without progress after which it is the teacher's turn there
 PATIENCE = 120  # control steps without progress that end an episode: nothing new is seen
 _LITTLE = 1e-3  # that is no progress [-]
 _ACTS, _LEAST = 0.4, 0.2  # share of the training after which the teacher acts least, and how often
@@ -181,6 +182,7 @@ class Distillation(Student):
       _, _, over, extras = self._step(said)
       begun = over.float()
       self._best.masked_fill_(over.bool(), -math.inf)
+      self._idle.masked_fill_(over.bool(), 0.0)
       for each in (actor, self._teacher):
         each.reset(over)
       if extras["log"]:
@@ -188,6 +190,7 @@ class Distillation(Student):
       drawn = torch.rand(2, env.num_envs, generator=self._random, device=env.device)
       again = over.bool() | (drawn[0] < 1 / _TURN)
       self._helped = torch.where(again, drawn[1] < helps, self._helped)
+      self._helped |= self._idle > _STUCK
       if self._left:
         self._helped &= ~self._alone
     return {name: torch.stack(values) for name, values in rows.items()} | {"state": first[None]}

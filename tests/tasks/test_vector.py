@@ -11,6 +11,8 @@ from gymnasium.vector import AutoresetMode  # noqa: E402
 from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
 from palpate.tasks import registry  # noqa: E402
 from palpate.tasks.core import performer, scenes  # noqa: E402
+from palpate.tasks.domains import cut as cutting  # noqa: E402
+from palpate.tasks.domains import trace  # noqa: E402
 
 # float32 of the batch against float64, of either hand; jaws on a fold of tissue magnify it.
 LIMITS = {"contact_force": 0.02, "shaft_force": 0.02, "peak_force": 0.02, "gripper": 0.1}
@@ -393,7 +395,22 @@ def test_a_curve_is_marked_where_to_begin_and_no_longer_where_it_is_traced():
     left = np.flatnonzero(marks[:, 3] > 0)
     yellow = np.isclose(marks[left, :3], scenes.NOW, atol=1e-6).all(axis=1)
     assert least <= len(left) <= most and left[-1] == 29
-    assert yellow[0] and not yellow[1:].any()
+    assert yellow[: trace.LEAD].all() and not yellow[trace.LEAD :].any()
+  envs.close()
+
+
+def test_the_line_to_cut_is_marked_where_to_begin_and_which_way_round():
+  seen = dict(observations=["pixels"], pixels=(84, 84), surroundings="none")
+  env, envs = single("cut/easy", renderer="cpu", **seen), make("cut/easy", 1, **seen)
+  pictures = [np.array(e.reset(seed=0)[0]["pixels"], float).reshape(84, 84, 3) for e in (envs, env)]
+  found, expected = ((p[..., 1] > 140) & (p[..., 2] < 80) for p in pictures)
+  assert 3 < expected.sum() < 20 and (found == expected).mean() > 0.999
+  task, physics = env.unwrapped.environment.task, env.unwrapped.environment.physics
+  task.cut[5:20], task.next = True, 20
+  task.show(physics)
+  marks = physics.model.site_rgba[physics.target_sites]
+  yellow = np.isclose(marks[:, :3], scenes.NOW, atol=1e-6).all(axis=1) & (marks[:, 3] > 0)
+  assert np.array_equal(np.flatnonzero(yellow), 10 + np.arange(cutting.LEAD))
   envs.close()
 
 
