@@ -7,12 +7,16 @@ brought up to date before: bodies, organs' vertices and normals. `exercise` take
 control steps of the vectorised exercise with random actions, with and without `pixels`.
 `mujoco_warp` is its renderer on the same device, of the same surroundings as meshes and of the
 organ's skin as a flex, beside a tool of 14 shapes; its trees are refitted before each picture.
-On CUDA work is replayed from a graph.
+On CUDA work is replayed from a graph. `export` observes `pixels`, `depth` and `segmentation` of the
+single environment after a control step, as `palpate export` does, with each renderer by turns:
+OpenGL where there is one, and Palpate's on the processor and on CUDA; a second is of the median.
 """
 
 from __future__ import annotations
 
 import argparse
+import collections
+import contextlib
 import pathlib
 import time
 import warnings
@@ -29,6 +33,8 @@ from palpate.tasks.batch.vector import Exercises
 from palpate.tasks.core import scenes
 
 REPEATS = 10
+STEPS = 40  # control steps of a renderer
+EXPORTED = ["pixels", "depth", "segmentation"]
 _NUMBERS = {"observations": ["sensors"]}
 _MESH, _TEXTURE = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtTexture.mjTEXTURE_2D
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
@@ -57,7 +63,7 @@ def clock(work, device) -> float:
   return (time.perf_counter() - start) / REPEATS
 
 
-def draw(task: str, nworld: int, size: int, device: str) -> dict:
+def draw(task: str, nworld: int, size: int, device: str) -> list[dict]:
   """Returns what pictures of a camera take."""
   batch = palpate.batch.make(spec_of(task), nworld, device)
   free = batch.device.free_memory if batch.device.is_cuda else 0
@@ -65,10 +71,10 @@ def draw(task: str, nworld: int, size: int, device: str) -> dict:
   camera.draw()
   used = (free - batch.device.free_memory) / nworld if batch.device.is_cuda else float("nan")
   taken = clock(camera.launch, batch.device)
-  return {"rate": nworld / taken, "world_kB": used / 1e3}
+  return [{"rate": nworld / taken, "world_kB": used / 1e3}]
 
 
-def act(task: str, nworld: int, size: int, device: str) -> dict:
+def act(task: str, nworld: int, size: int, device: str) -> list[dict]:
   """Returns what control steps take, with pixels where these have a size."""
   seen = {"observations": ["sensors", "pixels"], "pixels": (size, size)}
   output = "torch" if "cuda" in device else "numpy"
@@ -85,7 +91,7 @@ def act(task: str, nworld: int, size: int, device: str) -> dict:
     env.step(rows[k % len(rows)])
   wp.synchronize_device(env.device)
   taken = (time.perf_counter() - start) / (2 * REPEATS)
-  return {"rate": nworld / taken, "world_kB": float("nan")}
+  return [{"rate": nworld / taken, "world_kB": float("nan")}]
 
 
 def flexed(model: mujoco.MjModel, vert: np.ndarray, face: np.ndarray) -> mujoco.MjModel:
@@ -152,7 +158,7 @@ def flexed(model: mujoco.MjModel, vert: np.ndarray, face: np.ndarray) -> mujoco.
     return spec.compile()
 
 
-def peer(task: str, nworld: int, size: int, device: str) -> dict:
+def peer(task: str, nworld: int, size: int, device: str) -> list[dict]:
   """Returns what pictures of mujoco_warp's renderer take."""
   batch = palpate.batch.make(spec_of(task), 1, "cpu")
   vert, face = batch.camera(scenes.CAMERA, size, size).skin(scenes.ORGAN)
@@ -168,10 +174,34 @@ def peer(task: str, nworld: int, size: int, device: str) -> dict:
       mjw.refit_bvh(m, d, context)
       mjw.render(m, d, context)
 
-    return {"rate": nworld / clock(work, target), "world_kB": float("nan")}
+    return [{"rate": nworld / clock(work, target), "world_kB": float("nan")}]
 
 
-KINDS = {"camera": draw, "exercise": act, "mujoco_warp": peer}
+def export(task: str, nworld: int, size: int, device: str) -> list[dict]:
+  """Returns what pictures of the single environment take, a row a renderer."""
+  envs = {}
+  for renderer in ("opengl", "cpu", *([device] if "cuda" in device else [])):
+    options = {"random": 0, "observations": EXPORTED, "pixels": (size, size), "renderer": renderer}
+    env = suite.load(*task.split("/"), task_kwargs=options)
+    with contextlib.suppress(Exception):  # without OpenGL each backend has an error of its own
+      env.reset()
+      envs[renderer] = env
+  random, times = np.random.RandomState(0), collections.defaultdict(list)
+  for _ in range(STEPS):
+    action = random.uniform(-0.3, 0.3, next(iter(envs.values())).action_spec().shape)
+    for renderer, env in envs.items():
+      if env.step(action).last():
+        env.reset()
+      start = time.perf_counter()
+      env.task.get_observation(env.physics)
+      times[renderer].append(time.perf_counter() - start)
+  return [
+    {"device": renderer, "rate": 1.0 / np.median(taken), "world_kB": float("nan")}
+    for renderer, taken in times.items()
+  ]
+
+
+KINDS = {"camera": draw, "exercise": act, "mujoco_warp": peer, "export": export}
 
 
 def arguments(parser: argparse.ArgumentParser):
@@ -179,6 +209,7 @@ def arguments(parser: argparse.ArgumentParser):
   add = parser.add_argument
   add("--device", default="warp-cpu", help="warp-cpu or cuda:0 (%(default)s)")
   add("--tasks", nargs="+", default=["touch/easy", "grasp/easy"])
+  add("--kinds", nargs="+", choices=KINDS, default=[*KINDS], help="what to time (all)")
   add("--worlds", type=int, help="2 on the CPU, 4096 on CUDA")
   add("--sizes", type=int, nargs="+", default=[64, 84, 128], help="of pictures (%(default)s)")
 
@@ -189,44 +220,56 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   named = [("camera", task, size) for task in args.tasks for size in args.sizes]
   named += [("mujoco_warp", args.tasks[0], size) for size in args.sizes]
   named += [("exercise", task, size) for task in args.tasks for size in (84, 0)]
+  named += [("export", args.tasks[0], size) for size in (84, 240)]
   cases = [
-    {"case": f"{kind}-{task}-{size}", "kind": kind, "task": task, "size": size, "nworld": n}
-    | {"device": args.device}
+    {"case": f"{kind}-{task}-{size}", "kind": kind, "task": task, "size": size}
+    | {"nworld": 1 if kind == "export" else n, "device": args.device}
     for kind, task, size in named
+    if kind in args.kinds
   ]
   return [cases[:1] if args.short else cases]
 
 
 def run(case: Case, out: pathlib.Path) -> list[Row]:
-  """Returns the row of a case."""
+  """Returns the rows of a case."""
   named = {name: case[name] for name in ("task", "nworld", "size", "device")}
-  return [{"kind": case["kind"], **named, **KINDS[case["kind"]](**named)}]
+  return [{"kind": case["kind"], **named, **row} for row in KINDS[case["kind"]](**named)]
 
 
 def finding(rows: list[Row]) -> list[str]:
   """Returns what the page begins with."""
-  out = []
-  for kind, what in (("camera", "pictures"), ("mujoco_warp", "pictures of mujoco_warp's renderer")):
-    found = [r for r in rows if r["kind"] == kind and r["size"] == 84]
-    out += [f"`{r['task']}` at 84 x 84: {r['rate']:,.0f} {what} a second." for r in found[:1]]
-  found = [r for r in rows if r["kind"] == "exercise" and r["size"]][:1]
-  text = "with pixels, control steps a second"
-  return out + [f"`{r['task']}` {text}: {r['rate']:,.0f}." for r in found]
+
+  def of(kind: str, size: int) -> list[Row]:
+    return [r for r in rows if r["kind"] == kind and r["size"] == size]
+
+  out = [f"`{r['task']}` at 84 x 84: {r['rate']:,.0f} pictures a second" for r in of("camera", 84)]
+  out = out[:1] + [f"mujoco_warp's renderer {r['rate']:,.0f}" for r in of("mujoco_warp", 84)]
+  lines = ["; ".join(out)]
+  acted = [f"`{r['task']}` {r['rate']:,.0f}" for r in of("exercise", 84)]
+  lines += [f"Control steps a second with `pixels` of 84 x 84: {', '.join(acted)}"] if acted else []
+  ratios = []
+  for size in sorted({r["size"] for r in rows if r["kind"] == "export"}):
+    first, *others = of("export", size)
+    of_first = [f"{r['device']} {r['rate'] / first['rate']:.1f}" for r in others]
+    ratios += [f"{', '.join(of_first)} at {size} x {size}"] if of_first else []
+  rate = "Pictures a second of `palpate export`, times those of the first renderer"
+  lines += [f"{rate}: {', '.join(ratios)}"] if ratios else []
+  return [f"{line}." for line in lines if line]
 
 
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
-  head = ["what", "exercise", "worlds", "size", "a second", "a world takes"]
+  head = ["what", "exercise", "drawn by", "worlds", "size", "a second", "a world takes"]
   lines = plots.table(
     head,
     [
-      [r["kind"], r["task"], r["nworld"], r["size"] or "none", f"{r['rate']:,.0f}",
+      [r["kind"], r["task"], r["device"], r["nworld"], r["size"] or "none", f"{r['rate']:,.0f}",
        "" if np.isnan(r["world_kB"]) else f"{r['world_kB']:.0f} kB"]
       for r in rows
     ],
   )  # fmt: skip
   title = "Pictures in many worlds"
-  shown = [r for r in rows if r["kind"] != "exercise"]
+  shown = [r for r in rows if r["kind"] in ("camera", "mujoco_warp")]
   names = [f"{r['kind']} {r['task']} {r['size']}" for r in shown]
   rates = {"": [r["rate"] for r in shown]}
   picture = plots.bars(out / "pictures.png", title, names, rates, "pictures a second")
