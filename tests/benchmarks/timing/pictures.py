@@ -250,10 +250,11 @@ def finding(rows: list[Row]) -> list[str]:
   ratios = []
   for size in sorted({r["size"] for r in rows if r["kind"] == "export"}):
     first, *others = of("export", size)
-    of_first = [f"{r['device']} {r['rate'] / first['rate']:.1f}" for r in others]
-    ratios += [f"{', '.join(of_first)} at {size} x {size}"] if of_first else []
-  rate = "Pictures a second of `palpate export`, times those of the first renderer"
-  lines += [f"{rate}: {', '.join(ratios)}"] if ratios else []
+    ratios += [
+      f"{r['device']} {r['rate'] / first['rate']:.1f} times {first['device']} at {size} x {size}"
+      for r in others
+    ]
+  lines += [f"Pictures a second of `palpate export`: {', '.join(ratios)}"] if ratios else []
   return [f"{line}." for line in lines if line]
 
 
