@@ -107,8 +107,9 @@ def give(
     gamma: discount of a control step [-]
     noise: SD of what is added to the expert's motion now and then; what is kept is what it meant
       to do (DART: Laskey et al. 2017, 10.48550/arXiv.1703.09327) [-]
-    learner: begins, and takes turns with experts
-    most: control steps of its turns at most; all, by default, as long as it gets on
+    learner: takes turns with experts, and begins
+    most: control steps of its turns at most; all, by default, as long as it gets on. With it an
+      expert begins every other time: who fails at once would not be taught how to begin
   """
   task: Any = env.task
   task.random, random = np.random.RandomState(seed), np.random.RandomState(seed)
@@ -156,7 +157,7 @@ class _Turns:
     self._env, self._random, self._most, self._both = env, random, most, both
     self._expert: Teacher | None = None
     self.helped = False
-    self._begin(not both)
+    self._begin(not both or (most is not None and random.rand() < 0.5))
 
   def next(self, ends: bool) -> Teacher | None:
     """Returns the expert if it is the next to act; `ends` is whether a policy wants to end all."""

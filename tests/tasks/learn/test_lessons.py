@@ -84,11 +84,13 @@ def test_a_lesson_is_what_the_expert_meant_from_its_turn_on():
   assert not np.allclose(shaken.meant[:count], alone.meant[:count], atol=0.05)
   assert not np.allclose(shaken.meant, shaken.done, atol=0.05)
   assert not shaken.meant[:, 2].any()  # who never rolls the shaft teaches not to
-  both = lessons.give(env, names, 5, 0.5, learner=says([0, 0, 0, -0.5]), most=20)
+  both = lessons.give(env, names, 6, 0.5, learner=says([0, 0, 0, -0.5]), most=20)
   assert both.outcome == "success" and not both.alone and not both.taught[0]
   assert (both.done[~both.taught] == [0, 0, 0, -0.5]).all() and 5 < both.taught.sum()
   far = np.linalg.norm(both.seen[:, :3], axis=1)
   assert far[both.taught.argmax()] > far[0] + 0.0005  # it backed away
+  other = lessons.give(env, names, 7, 0.5, learner=says([0, 0, 0, -0.5]), most=20)
+  assert other.taught[: lessons.EXPERT[0]].all()  # there the expert begins
 
 
 def test_who_does_not_get_on_is_helped_and_what_did_not_help_is_not_learned():
