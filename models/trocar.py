@@ -20,7 +20,7 @@ import numpy as np
 from palpate.engine.model.flexes import matrix
 from palpate.tissue.reading import choices
 
-NAMES = ("probe", "grasper", "scissors", "hook", "scalpel", "laparoscope")
+NAMES = ("probe", "grasper", "scissors", "hook", "scalpel", "laparoscope", "knot_pusher")
 WRISTED = ("psm",)  # with a wrist, and without a handle, see `wrist`
 JAWED = ("grasper", "scissors", "psm")
 JOINTS = ("pitch", "yaw", "insertion", "roll")

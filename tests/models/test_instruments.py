@@ -233,7 +233,7 @@ def test_presses_a_box_with_few_contacts_and_reads_the_force(name):
   assert 1 < -force[2] < 2.5  # the drive is 4000 N/m and the contact gives a little
   np.testing.assert_allclose(-force[2], data.sensor("insertion_force").data[0], rtol=1e-2)
   np.testing.assert_allclose(force[:2], 0, atol=1e-2)
-  assert 1 <= data.ncon <= 4
+  assert 1 <= data.ncon <= (12 if name == "knot_pusher" else 4)  # its ring lies on all its pieces
   assert data.sensor("tip_contacts").data[0] == data.ncon
   assert data.sensor("shaft_contacts").data[0] == 0
 
