@@ -218,6 +218,8 @@ class Worlds(Batch):
     organs = list(self._organs.values())
 
     def touch(m, d):
+      if self._order:
+        self._order.sort_contacts()
       for organ in organs:
         organ.touch()
 

@@ -79,6 +79,32 @@ def test_rows_come_in_the_same_order_whoever_asked_first():
   assert equal(rows(batch), first)
 
 
+@pytest.mark.parametrize("device", ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)])
+def test_contacts_of_geoms_come_in_the_same_order_whoever_was_first(device):
+  """By worlds, geoms and their number, with all that is known of them."""
+  batch = palpate.batch.make(mujoco.MjSpec.from_string(probed()), 3, device, deterministic=True)
+  order, contact, random = FixedOrder(batch.m, batch.d), batch.d.contact, np.random.RandomState(0)
+  key = np.array([(w, 2, g, n) for w in (0, 2) for g in (3, 5) for n in range(3)])
+  count = len(key)
+
+  def told(key):
+    """Returns what contacts say that are told apart by world, geoms and number."""
+    out = {"worldid": key[:, 0], "geom": key[:, 1:3], "geomcollisionid": key[:, 3]}
+    return out | {"dist": key @ [1e3, 0, 10, 1], "pos": key[:, [0, 2, 3]]}
+
+  for _ in range(5):
+    for name, values in told(random.permutation(key)).items():
+      array = getattr(contact, name)
+      whole = array.numpy()
+      whole[:count] = values
+      array.assign(whole)
+    batch.d.nacon.fill_(count)
+    order.sort_contacts()
+    for name, values in told(key).items():
+      found = getattr(contact, name).numpy()[:count]
+      np.testing.assert_array_equal(found, values, err_msg=name)
+
+
 def test_contacts_of_a_sensor_come_in_the_same_order_whoever_was_first():
   """By the sensor's criterion, then by their places; ~ where its body is the second."""
   random, most = np.random.RandomState(0), 16

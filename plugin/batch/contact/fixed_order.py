@@ -1,9 +1,9 @@
 """Steps of mujoco_warp that repeat to the bit, whatever the GPU does first.
 
-mujoco_warp's threads ask for constraint rows, which are placed as they come, and add up over rows
-by atomics. Here rows are put in an order that depends on the state alone, and the few sums over
-them are taken in it. Warp's own deterministic mode, which mujoco_warp has for all of its sums,
-writes down every addend of every kernel and sorts them all.
+mujoco_warp's threads ask for contacts and constraint rows, which are placed as they come, and add
+up over them by atomics. Here contacts and rows are put in an order that depends on the state alone,
+and the few sums over them are taken in it. Warp's own deterministic mode, which mujoco_warp has for
+all of its sums, writes down every addend of every kernel and sorts them all.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -11,6 +11,7 @@ writes down every addend of every kernel and sorts them all.
 # pyright: reportCallIssue=false, reportArgumentType=false, reportOperatorIssue=false
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false
 import contextlib
+import dataclasses
 import functools
 from collections.abc import Iterator
 from typing import Any
@@ -29,12 +30,14 @@ _FLOATS = ("pos", "margin", "D", "vel", "aref", "frictionloss")
 _CONTACT = wp.constant(int(ConstraintType.CONTACT_FRICTIONLESS))  # and what comes after it
 _FRICTION = wp.constant(int(ConstraintType.FRICTION_DOF))
 _PAIR = wp.constant(64)  # contacts of two geoms, at most
+# Contacts of a world's geoms that are put in order; more stay as they came.
+_ROOM = wp.constant(64)
 _LANES = wp.constant(16)  # threads of a world that add up what rows do to dofs
 
 
 @struct
 class Ints:
-  """A column of all rows."""
+  """A column of all rows, or one of all contacts in words of 32 bits."""
 
   column: ints("nworld", "njmax")
 
@@ -47,10 +50,26 @@ class Floats:
 
 
 @struct
+class Pairs:
+  """The contacts that mujoco_warp has found between geoms, and room to put them in order."""
+
+  ngeom: int
+  nacon: ints(1)
+  geom: Array(wp.vec2i, ("naconmax",))
+  number: ints("naconmax")  # among those of two geoms
+  worldid: ints("naconmax")
+  moved: Array(Ints, ("ncolumn",))  # what moves
+  count: ints("nworld")  # contacts of a world
+  before: ints("nworld")  # those of the worlds before it
+  listed: ints("nworld", _ROOM)  # as they came
+  place: ints("naconmax")  # where one goes among those of its world
+  kept: ints("nword", "naconmax")  # what is moved
+
+
+@struct
 class Rows:
   """The constraint rows of mujoco_warp, and room to put them in order."""
 
-  ngeom: int
   nefc: ints("nworld")
   nblock: ints("nworld")  # blocks of rows that share their dofs
   block_adr: ints("nworld", "njmax")  # their first row
@@ -60,8 +79,6 @@ class Rows:
   moved: Array(Ints, ("nint",))  # what moves: `_INTS`, and `part`
   moved_float: Array(Floats, ("nfloat",))
   frictionadr: ints("nworld", "nv")  # row of a dof's friction
-  contact_geom: Array(wp.vec2i, ("naconmax",))
-  contact_number: ints("naconmax")  # among those of two geoms
   contact_row: ints("naconmax", "nrow")
   key: Array(wp.int64, ("nworld", "njmax"))  # what rows are ordered by
   part: ints("nworld", "njmax")  # which of its contact's rows
@@ -72,30 +89,89 @@ class Rows:
 
 
 @wp.func
+def _found(p: Pairs):
+  return wp.min(p.nacon[0], p.place.shape[0])
+
+
+@wp.kernel(enable_backward=False)
+def _list_contacts(p: Pairs):
+  """Lists the contacts of each world."""
+  c = wp.tid()
+  if c >= _found(p):
+    return
+  w = p.worldid[c]
+  k = wp.atomic_add(p.count, w, 1)
+  p.place[c] = k
+  if k < _ROOM:
+    p.listed[w, k] = c
+
+
+@wp.func
+def _pair_key(p: Pairs, c: int):
+  pair = p.geom[c]
+  return wp.int64(pair[0] * p.ngeom + pair[1]) * wp.int64(_PAIR) + wp.int64(p.number[c])
+
+
+@wp.kernel(enable_backward=False)
+def _place_contacts(p: Pairs):
+  """Finds where contacts go among those of their world: by their geoms, then by their number."""
+  w, k = wp.tid()
+  n = wp.min(p.count[w], _ROOM)
+  if k >= n:
+    return
+  c = p.listed[w, k]
+  key = _pair_key(p, c)
+  to = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for q in range(n):
+    if _pair_key(p, p.listed[w, q]) < key:
+      to += 1
+  p.place[c] = to
+
+
+@wp.kernel(enable_backward=False)
+def _keep_contacts(p: Pairs):
+  """Keeps contacts at their places."""
+  c = wp.tid()
+  if c >= _found(p):
+    return
+  to = p.before[p.worldid[c]] + p.place[c]
+  word = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for f in range(p.moved.shape[0]):
+    column = p.moved[f].column
+    for k in range(column.shape[1]):
+      p.kept[word, to] = column[c, k]
+      word += 1
+
+
+@wp.kernel(enable_backward=False)
+def _move_contacts(p: Pairs):
+  """Moves contacts to their places."""
+  c = wp.tid()
+  if c >= _found(p):
+    return
+  word = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for f in range(p.moved.shape[0]):
+    column = p.moved[f].column
+    for k in range(column.shape[1]):
+      column[c, k] = p.kept[word, c]
+      word += 1
+
+
+@wp.func
 def _count(r: Rows, w: int):
   return wp.min(r.nefc[w], r.type.shape[1])
 
 
 @wp.kernel(enable_backward=False)
 def _find_keys(r: Rows):
-  """Finds what rows are ordered by: the constraint, of a contact its geoms, or its place.
-
-  Contacts of an organ have places in a fixed order, see `contact.contacts`.
-  """
+  """Finds what rows are ordered by: the kind of constraint, and its number."""
   w, k = wp.tid()
   if k >= _count(r, w):
     return
-  key = wp.int64(r.id[w, k])
   part = int(0)  # noqa: RUF046, UP018 - a variable to Warp
   if r.type[w, k] >= _CONTACT:
-    c = r.id[w, k]
-    part = k - r.contact_row[c, 0]
-    pair = r.contact_geom[c]
-    if pair[0] >= 0 and pair[1] >= 0:
-      key = wp.int64(pair[0] * r.ngeom + pair[1]) * wp.int64(_PAIR) + wp.int64(r.contact_number[c])
-    else:
-      key += wp.int64(1) << wp.int64(44)
-  r.key[w, k] = key + (wp.int64(r.type[w, k]) << wp.int64(48))
+    part = k - r.contact_row[r.id[w, k], 0]
+  r.key[w, k] = wp.int64(r.id[w, k]) + (wp.int64(r.type[w, k]) << wp.int64(48))
   r.part[w, k] = part
 
 
@@ -292,6 +368,15 @@ def is_enough(m: Any, model: mujoco.MjModel) -> bool:
   )  # fmt: skip
 
 
+def _words(array: wp.array) -> wp.array:
+  """Returns an array of numbers of 32 bits in words, a row an element."""
+  count = wp.types.type_size_in_bytes(array.dtype) // 4
+  shape = array.shape[0], count
+  out: Any = wp.array(ptr=array.ptr, dtype=int, shape=shape, device=array.device)
+  out.of = array
+  return out
+
+
 def _columns(kind: Any, arrays: list[wp.array]) -> wp.array:
   """Returns an array of structs, each of which refers to one of the arrays."""
   device = arrays[0].device
@@ -300,17 +385,16 @@ def _columns(kind: Any, arrays: list[wp.array]) -> wp.array:
 
 
 class FixedOrder:
-  """Puts the rows of mujoco_warp's constraints in order, and lets its step add them up in that."""
+  """Puts mujoco_warp's contacts and rows in order, and lets its step add them up in that."""
 
   def __init__(self, m: Any, d: Any):
-    """Makes room for rows on their way."""
+    """Makes room for contacts and rows on their way."""
     efc, contact, shape = d.efc, d.contact, (d.nworld, d.njmax)
     device = efc.type.device
     part = wp.zeros(shape, dtype=int, device=device)
     moved = [*(getattr(efc, name) for name in _INTS), part]
     numbers = [getattr(efc, name) for name in _FLOATS]
     values = dict(
-      ngeom=m.ngeom,
       nefc=d.nefc,
       nblock=efc.jtdaj_nblock,
       block_adr=efc.jtdaj_adr,
@@ -318,8 +402,6 @@ class FixedOrder:
       type=efc.type,
       id=efc.id,
       frictionadr=d.dof_frictionadr,
-      contact_geom=contact.geom,
-      contact_number=contact.geomcollisionid,
       contact_row=contact.efc_address,
       moved=_columns(Ints, moved),
       moved_float=_columns(Floats, numbers),
@@ -329,6 +411,32 @@ class FixedOrder:
     values |= {name: np.zeros((*more, *shape)) for name, more in rooms.items()}
     self._rows = fill(Rows, device, values | {"key": np.zeros(shape, np.int64)})
     self._shape = shape
+    each = [getattr(contact, name.name) for name in dataclasses.fields(contact)]
+    words = [_words(array) for array in each if array.shape == contact.dist.shape]
+    self._pairs = fill(Pairs, device, dict(
+      ngeom=m.ngeom,
+      nacon=d.nacon,
+      geom=contact.geom,
+      number=contact.geomcollisionid,
+      worldid=contact.worldid,
+      moved=_columns(Ints, words),
+      count=np.zeros(d.nworld),
+      before=np.zeros(d.nworld),
+      listed=np.zeros((d.nworld, _ROOM)),
+      place=np.zeros(d.naconmax),
+      kept=np.zeros((sum(array.shape[1] for array in words), d.naconmax)),
+    ))  # fmt: skip
+    self._held = words
+
+  def sort_contacts(self) -> None:
+    """Launches what puts contacts in order, once those of geoms are found and before others are."""
+    p, device = self._pairs, self._pairs.nacon.device
+    p.count.zero_()
+    wp.launch(_list_contacts, dim=p.place.shape, inputs=[p], device=device)
+    wp.launch(_place_contacts, dim=p.listed.shape, inputs=[p], device=device)
+    wp.utils.array_scan(p.count, p.before, inclusive=False)
+    wp.launch(_keep_contacts, dim=p.place.shape, inputs=[p], device=device)
+    wp.launch(_move_contacts, dim=p.place.shape, inputs=[p], device=device)
 
   def sort(self) -> None:
     """Launches what puts the rows in order, once they are made and before they are used."""
