@@ -19,25 +19,27 @@ import numpy as np
 FOLDER = pathlib.Path(__file__).with_name("pictures")
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 WIDE, PHONE = (1280, 800), (390, 844)
-# State -> size, what is clicked, keys that are held for so long [ms], and whether it is stopped.
+# State -> size, what is clicked, and how hands move then: right, up, back [m], roll [rad], camera.
+SMALL = {"right": (0.0, 0.0, 0.0, 0.05, 0.0)}
 STATES = {
-  "home": (WIDE, None, {}, False),
-  "tutorial": (WIDE, "#tab-tutorial", {}, False),
-  "exercise": (WIDE, "[data-task='touch/easy']", {"z": 100}, False),
-  "warning": (WIDE, "[data-task='grasp/easy']", {"d": 2500}, False),
-  "two_hands": (WIDE, "[data-task='bimanual/easy']", {"d": 200}, False),
-  "needle": (WIDE, "[data-task='needle/transfer_easy']", {"z": 100}, False),
-  "suture": (WIDE, "[data-task='suture/drive_easy']", {"z": 100}, False),
-  "navigate": (WIDE, "[data-task='navigate/standard']", {"s": 500, "b": 400}, False),
-  "camera": (WIDE, "[data-task='grasp/easy']", {"j": 900, "n": 700}, False),
-  "cut": (WIDE, "[data-task='cut/standard']", {}, False),
-  "card": (WIDE, "[data-task='touch/easy']", {"d": 300}, True),
-  "practice": (WIDE, "#tab-practice", {}, False),
-  "line": (WIDE, "#tab-practice", {}, False),
-  "burn": (WIDE, "#tab-practice", {}, False),
-  "phone": (PHONE, "[data-task='trace/easy']", {"d": 200}, False),
-  "phone_home": (PHONE, None, {}, False),
+  "home": (WIDE, None, {}),
+  "tutorial": (WIDE, "#tab-tutorial", {}),
+  "exercise": (WIDE, "[data-task='touch/easy']", SMALL),
+  "warning": (WIDE, "[data-task='grasp/easy']", {"right": (0.09, 0.0, 0.0, 0.0, 0.0)}),
+  "two_hands": (WIDE, "[data-task='bimanual/easy']", {"right": (0.008, 0.0, 0.0, 0.0, 0.0)}),
+  "needle": (WIDE, "[data-task='needle/transfer_standard']", SMALL),
+  "suture": (WIDE, "[data-task='suture/drive_easy']", SMALL),
+  "navigate": (WIDE, "[data-task='navigate/standard']", {"right": (0.0, -0.015, 0.0, 0.0, 0.08)}),
+  "camera": (WIDE, "[data-task='grasp/easy']", {"scope": (-0.03, 0.0, 0.0, -0.9, 0.0)}),
+  "cut": (WIDE, "[data-task='cut/standard']", {}),
+  "card": (WIDE, "[data-task='touch/easy']", {"right": (0.01, 0.0, 0.0, 0.0, 0.0)}),
+  "practice": (WIDE, "#tab-practice", {}),
+  "line": (WIDE, "#tab-practice", {}),
+  "burn": (WIDE, "#tab-practice", {}),
+  "phone": (PHONE, "[data-task='trace/easy']", {"right": (0.006, 0.0, 0.0, 0.0, 0.0)}),
+  "phone_home": (PHONE, None, {}),
 }
+STOPPED = ("card",)
 ANSWER = 120e3  # [ms]
 # What the page knows, and its connection, to move the hand by.
 LISTEN = """const {send} = WebSocket.prototype;
@@ -50,8 +52,8 @@ LOOK = """(() => {
   const {force, tip_x, tip_y, tip_z} = head;
   return {force, tip: [tip_x, tip_y, tip_z], mat: scene.camera.mat, targets};
 })()"""
-MOVE = """([move, buttons]) => window.program.send(JSON.stringify(
-  {type: "hand", which: "right", move, rate: [0, 0, 0, 0], buttons}))"""
+MOVE = """([move, buttons, which, jaw]) => window.program.send(JSON.stringify(
+  {type: "hand", which: which ?? "right", move, rate: [0, 0, 0, 0], buttons, jaw}))"""
 PRESS = 0.05  # of a hook on tissue [N]
 DEEP, HIGH = -0.004, 0.012  # of a blade over the line [m]
 CUT = 10  # marks along which it cuts
@@ -104,7 +106,7 @@ HANDS = {"burn": burn, "cut": cut, "line": line}
 
 def draw(browser, url: str, name: str) -> None:
   """Writes the picture of a state."""
-  (width, height), start, keys, stopped = STATES[name]
+  (width, height), start, moves = STATES[name]
   phone = (width, height) == PHONE
   page = browser.new_page(viewport={"width": width, "height": height}, has_touch=phone)
   page.add_init_script(LISTEN)
@@ -122,13 +124,14 @@ def draw(browser, url: str, name: str) -> None:
     page.wait_for_timeout(3000)
   if name in HANDS:
     HANDS[name](page)
-  for key, held in keys.items():
-    page.focus("#view")
-    page.keyboard.down(key)
-    page.wait_for_timeout(held)
-    page.keyboard.up(key)
+  for which, (*move, camera) in moves.items():
+    steps = 40  # no hand jumps; a held key would go as far as the picture is slow
+    for k in range(steps):
+      turned = (k + 1) / steps * camera if camera else None
+      page.evaluate(MOVE, [[x / steps for x in move], [], which, turned])
+      page.wait_for_timeout(30)
     page.wait_for_timeout(2000)
-  if stopped:
+  if name in STOPPED:
     page.dispatch_event("#stop", "click")
     page.wait_for_selector("#card[open]", timeout=ANSWER)
   page.wait_for_timeout(1500)

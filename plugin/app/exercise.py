@@ -320,7 +320,7 @@ def _write_files(
       file.write(recording.metrics().to_json(1) + "\n")
     if report and len(recording.time):
       shot = job.film.read_bytes() if job.film and job.film.suffix == ".mp4" else None
-      pictures = None if views is None else views.picture()
+      pictures = None if views is None else views.pictures()
       try:
         reference = job.references(job.name)
         page = write_report(recording, folder, reference, film=shot, pictures=pictures)

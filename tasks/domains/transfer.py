@@ -86,7 +86,7 @@ MASS = 7e-5  # of a needle of steel [kg]
 FIRM = {"solref": (0.005, 1.0), "solimp": (0.999, 0.999, 1e-3, 0.5, 2.0), "solmix": 1e3}
 FIELD = Scene(
   instrument="psm", second="psm", port=(-0.06, 0.04, 0.13), second_port=(0.06, 0.04, 0.13),
-  camera=(-0.055, 0.085, 0.1), nodes=250,
+  camera=(0.076, 0.108, 0.055), nodes=250,
 )  # fmt: skip
 _HIGH = 0.03  # of the rings over the organ [m]
 _APART = 0.034  # of rings: needle and wrist have room between them [m]

@@ -17,6 +17,8 @@ th { font-weight: 600; color: #5d6472; } td.n, th.n { text-align: right; white-s
   font-variant-numeric: tabular-nums; }
 tr.group td { background: #f4f6f9; font-weight: 600; }
 .wide { overflow-x: auto; }
+.strip { display: grid; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); gap: .3rem; }
+.strip img { width: 100%; }
 .outcome { font-size: 1.25rem; font-weight: 600; margin: .3rem 0; }
 .score { display: flex; gap: 1.5rem; align-items: baseline; flex-wrap: wrap; }
 .score b { font-size: 2.2rem; line-height: 1.2; }
@@ -28,6 +30,7 @@ dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; mar
 @media (max-width: 40rem) {
   body { margin: 1rem auto; padding: 0 .6rem; } table { font-size: .8rem; }
   th, td { padding: .25rem .3rem; } dl { grid-template-columns: 1fr; } dd { margin-bottom: .4rem; }
+  .more { display: none; } .wide > img { max-width: none; width: 40rem; }
 }
 dt { color: #5d6472; } dd { margin: 0; overflow-wrap: anywhere; }
 """
@@ -49,12 +52,21 @@ def text(value: Any) -> str:
   return html.escape(str(value), quote=True)
 
 
-def row(cells: Iterable[str], numbers: Iterable[int] = (), tag: str = "td") -> str:
-  """Returns a table row of finished HTML; `numbers` are the columns to align right."""
-  right = set(numbers)
-  return "<tr>" + "".join(
-    f"<{tag}{' class=n' if k in right else ''}>{cell}</{tag}>" for k, cell in enumerate(cells)
-  ) + "</tr>"  # fmt: skip
+def row(
+  cells: Iterable[str], numbers: Iterable[int] = (), tag: str = "td", more: Iterable[int] = ()
+) -> str:
+  """Returns a table row of finished HTML.
+
+  Args:
+    cells: the row's
+    numbers: columns to align right
+    tag: of a cell
+    more: columns that a phone leaves out
+  """
+  kinds = [(set(numbers), "n"), (set(more), "more")]
+  shown = [(" ".join(kind for columns, kind in kinds if k in columns), cell)
+           for k, cell in enumerate(cells)]  # fmt: skip
+  return f"<tr>{''.join(f'<{tag} class={kind!r}>{cell}</{tag}>' for kind, cell in shown)}</tr>"
 
 
 def group(name: str, columns: int) -> str:
@@ -62,9 +74,14 @@ def group(name: str, columns: int) -> str:
   return f"<tr class='group'><td colspan='{columns}'>{text(name)}</td></tr>"
 
 
-def table(head: Iterable[str], rows: Iterable[str], numbers: Iterable[int] = ()) -> str:
-  """Returns a table of finished rows."""
-  first, rest = row(head, numbers, "th"), "".join(rows)
+def table(
+  head: Iterable[str],
+  rows: Iterable[str],
+  numbers: Iterable[int] = (),
+  more: Iterable[int] = (),
+) -> str:
+  """Returns a table of finished rows; see `row`."""
+  first, rest = row(head, numbers, "th", more), "".join(rows)
   return f"<div class='wide'><table><thead>{first}</thead><tbody>{rest}</tbody></table></div>"
 
 

@@ -47,7 +47,7 @@ def write_report(
     reference: see `score.make_reference`; without it there is no score
     title: heading; the recording's task by default
     film: of the exercise, MP4
-    pictures: of the exercise, side by side, (height, width, 3) uint8
+    pictures: of the exercise, from the start to the end  (n, height, width, 3) uint8
   """
   content = render(recording, reference, title, film, pictures)
   return write_page(Path(folder) / "report.html", content)
@@ -122,7 +122,12 @@ def _views(film: bytes | None, pictures: np.ndarray | None) -> str:
     return page.film(film, "what the laparoscope saw")
   if pictures is None:
     return ""
-  return page.image(jpeg(pictures), "what the laparoscope saw, from the start to the end", "jpeg")
+  count = len(pictures)
+  shown = (
+    page.image(jpeg(each), f"what the laparoscope saw, picture {k + 1} of {count}", "jpeg")
+    for k, each in enumerate(pictures)
+  )
+  return f"<div class='strip'>{''.join(shown)}</div>"
 
 
 def _score_part(result: Score | None) -> str:
@@ -184,7 +189,10 @@ def _plots(recording: Recording, metrics: Metrics) -> str:
     if figure is None:
       parts.append(f"<h2>{title}</h2><p>Nothing to draw: {text(reasons.get(absent, ''))}.</p>")
       continue
-    parts.append(f"<h2>{title}</h2>{page.image(png(figure), alt)}")
+    shown = page.image(png(figure), alt)
+    # A phone shows curves over time in part, large enough to be read.
+    wide = shown if title == "Path" else f"<div class='wide'>{shown}</div>"
+    parts.append(f"<h2>{title}</h2>{wide}")
   return "\n".join(parts)
 
 
@@ -202,6 +210,7 @@ def _metric_table(
   if result is not None:
     numbers += range(len(head), len(head) + 3)
     head += ["panel mean ± SD", "limit", "z"]
+  more = [head.index(name) for name in ("better", "panel mean ± SD") if name in head]
   rows = []
   for group in WEIGHTS:
     names = [name for name, spec in METRICS.items() if spec.group == group]
@@ -218,11 +227,11 @@ def _metric_table(
       cells += [text(spec.shown), spec.better if spec.better != "neither" else "–"]
       if reference is not None and result is not None:
         cells += _panel_cells(name, spec, reference, result)
-      rows.append(page.row(cells, numbers))
+      rows.append(page.row(cells, numbers, more=more))
   unknown = "".join(
     f"<dt>{text(METRICS[n].label)}</dt><dd>{text(r)}</dd>" for n, r in metrics.reasons().items()
   )
-  found = f"<h2>Metrics</h2>{page.table(head, rows, numbers)}"
+  found = f"<h2>Metrics</h2>{page.table(head, rows, numbers, more)}"
   return found + (f"<h2>Not known</h2><dl class='small'>{unknown}</dl>" if unknown else "")
 
 

@@ -111,13 +111,13 @@ class Strip:
       self._frames, self._every = self._frames[::2], 2 * self._every
     self._due = time + self._every
 
-  def picture(self) -> np.ndarray | None:
-    """Returns the pictures side by side, (height, width, 3) uint8; None without any."""
+  def pictures(self) -> np.ndarray | None:
+    """Returns the pictures  (n, height, width, 3) uint8; None without any."""
     if not self._frames:
       return None
     last = len(self._frames) - 1
     chosen = np.unique(np.linspace(0, last, self._count).round().astype(int))
-    return np.concatenate([self._frames[k] for k in chosen], axis=1)
+    return np.stack([self._frames[k] for k in chosen])
 
 
 def of_recording(recording: Any, size: tuple[int, int]) -> bytes:

@@ -240,7 +240,8 @@ def test_a_tone_is_what_is_heard(pages, kind):
 
 # A triangle that is drawn on from above and lifted by a centimetre; a tip touches beside the line.
 DRAW = """async () => {
-  const {Line} = await import("/line.js"), {Scene} = await import("/three/three.module.min.js");
+  const {Line} = await import("/scene/line.js");
+  const {Scene} = await import("/three/three.module.min.js");
   const line = new Line(new Scene()), x = new Float32Array([0, 0, 0, 0.1, 0, 0, 0, 0.1, 0]);
   const down = [0, 0, -1];
   for (let k = 0; k < 9; k++) line.add([0.01 + 0.003 * k, 0.02, 0.1], down, x, [0, 1, 2]);
@@ -268,7 +269,8 @@ def test_a_line_lies_on_the_tissue_and_is_followed(pages):
 
 # A thread around a quarter of a circle, whose last edge has broken.
 TUBE = """async () => {
-  const {Thread} = await import("/thread.js"), three = await import("/three/three.module.min.js");
+  const {Thread} = await import("/scene/thread.js");
+  const three = await import("/three/three.module.min.js");
   const thread = new Thread(new three.Scene(), 7, 1e-4, null);
   const turn = k => [0.01 * Math.cos(Math.PI * k / 12), 0.01 * Math.sin(Math.PI * k / 12)];
   thread.drape(Array.from({length: 7}, (_, k) => [...turn(k), 0, k === 5 ? 0 : 1]).flat());
@@ -377,6 +379,7 @@ def test_free_practice_on_the_page(pages):
   for name in ("force", "way", "rate"):
     assert page.is_visible(f"#plot-{name}")
   pages.until("window.palpate().head.time > 0.5", "no time")
+  page.wait_for_timeout(600)  # a plot is drawn ten times a second
   assert pages.ink("rate") and "steps a second" in page.inner_text("#loop")
   shots = [pages.picture()]
   page.click("#wire")

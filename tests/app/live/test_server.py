@@ -91,7 +91,7 @@ def test_the_page_and_its_files_are_there_and_nothing_else(serve):
   server = serve()
   status, text = get(server)
   assert status == 200 and "Palpate" in text and server.url == f"http://127.0.0.1:{server.port}/"
-  for path in ("/page.js", "/view.js", "/hand.js", "/page.css"):
+  for path in ("/page.js", "/scene/view.js", "/hand.js", "/page.css"):
     assert get(server, path)[0] == 200
   for path in ("/server.py", "/../server.py", "/%2e%2e/server.py", "/socketx"):
     assert get(server, path)[0] == 404

@@ -310,13 +310,12 @@ def test_a_cut_is_told_with_its_edges():
   env = palpate.tasks.load("cut", "easy", task_kwargs={"random": 0})
   env.reset()
   camera = Camera.of(env)
-  whole = camera.shapes()["organ"]["topology"]
-  assert not camera.cut() and unpack(whole["lips"]).size == 0
+  whole = camera.shapes()["organs"][0]["topology"]
+  assert not camera.cuts() and unpack(whole["lips"]).size == 0
   organ = env.physics.organ
   organ.cut(np.array([[-0.01, 0.0, 0.0], [0.01, 0.0, 0.0]]))
-  assert camera.cut()
-  told = camera.topology()
-  assert not camera.cut() and told["outer"] == len(organ.elem)
+  (told,) = camera.cuts()
+  assert not camera.cuts() and told["outer"] == len(organ.elem)
   np.testing.assert_array_equal(unpack(told["triangles"]).reshape(-1, 3), organ.elem)
   start, end, other = organ.xpos0[unpack(told["lips"]).reshape(-1, 3).T]
   along = np.linalg.norm(end - start, axis=1)
@@ -355,6 +354,26 @@ def unpack(packed):
   ((kind, text),) = packed.items()
   kinds = {"f": np.float32, "b": np.uint8, "h": np.uint16, "u": np.uint32}
   return np.frombuffer(base64.b64decode(text), kinds[kind])
+
+
+def test_every_organ_of_a_scene_is_drawn_and_lit(tmp_path):
+  spec, folder = mujoco.MjSpec(), models.path("kidney", scene=False).parent
+  for name, at in (("near", 0.0), ("far", 0.2)):
+    mesh = str(folder / "assets" / "kidney.obj")
+    palpate.add_organ(spec, mesh, name, young=5e3, foundation=1e5, pos=(at, 0, 0))
+  spec.compile()
+  spec.to_file(str(tmp_path / "two.xml"))
+  hands = {"probe": Hand()}
+  made = practice.Practice("", {}, hands, pace=Pace.instant(), scene=tmp_path / "two.xml")
+  told = made.camera.shapes()
+  near, far = told["organs"]
+  first, last = len(HEAD), len(HEAD) + 3 * told["nodes"]
+  frame = np.frombuffer(made.camera.frame(made.link, made.pace), np.float32)
+  np.testing.assert_allclose(frame[first:last].reshape(-1, 3), made.organ.xpos, atol=1e-6)
+  other = frame[last : last + 3 * far["count"]].reshape(-1, 3)
+  np.testing.assert_allclose(other, palpate.Organ(made.model, made.data, "far").xpos, atol=1e-6)
+  assert unpack(far["topology"]["triangles"]).max() < far["count"] == near["count"]
+  assert told["lights"][0]["pos"] is not None  # nothing else gives light
 
 
 def test_cutting_tools_cut_in_free_practice():

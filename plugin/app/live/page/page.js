@@ -6,7 +6,7 @@ import {Plot} from "./plots.js";
 import {speaker} from "./sounds.js";
 import {language, speak, t, title} from "./texts.js";
 import {PRACTICE, Tutorial} from "./tutorial.js";
-import {parts, View} from "./view.js";
+import {parts, View} from "./scene/view.js";
 
 const $ = id => document.getElementById(id);
 const STATES = ["waiting", "ready", "clutch", "lost", "paused"];
@@ -36,7 +36,7 @@ let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble 
 let last = null, arrived = 0, span = 0, mixed = null, pictured = 0;  // frames between which pictures lie [ms]
 let waited = false;  // for a movement
 let silent = "";  // what was said about a program that says nothing
-let turn = 0, told = 0, came = 0, shown = 0;
+let turn = 0, plotted = 0, told = 0, came = 0, shown = 0;
 const plots = {force: new Plot("force"), way: new Plot("way"), rate: new Plot("rate")};
 const ways = [], pictures = [];  // from hand to picture [ms]; when pictures were drawn
 const hand = new Hand($("view"), $("pad"), view, () => head);
@@ -399,7 +399,8 @@ function draw() {
     ways.push((performance.now() - echoed + CLOCK) % CLOCK + (1 - share) * span);
     if (ways.length > KEPT) ways.shift();
   }
-  // One a picture: ten times a second is enough for curves.
+  if (now - plotted < WORDS / 3) return;  // one at a time, each ten times a second
+  plotted = now;
   [() => plots.force.draw(scene.force_limit), () => plots.way.draw(undefined, 2, 0.5), () => plots.rate.draw(undefined, 0)][turn++ % 3]();
 }
 requestAnimationFrame(draw);

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import base64
-import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -17,11 +15,10 @@ from palpate import Organ, Thread
 from palpate.engine.model.flexes import matrix
 from palpate.models.situs import LIGHT
 from palpate.organ import instances
-from palpate.tissue.geometry import subdivide
-from scipy.sparse import csr_array, vstack
 
 from ..coupling import Link
 from ..realtime_clock import Pace
+from .surface import Surface, look, pack, paper
 
 FPS = 60  # frames a second that free practice publishes, at most
 # Numbers at the head of a frame, before the nodes, the bodies' places and the sites; `echo` is the
@@ -36,8 +33,6 @@ STATES = ("waiting", "ready", "clutch", "lost", "paused")
 _SENSORS = ("tip_force", "shaft_force", "tip_pos", "tip_quat")
 HOOK = "hook/"  # prefix of the instrument that sends a current
 _SHOWN = 2  # the last group of geoms, sites and skins that is drawn
-_TINY = 2e-3  # weight below which a vertex does not count in a vertex of the skin
-_CHUNK = 250  # columns of the skin's matrix at a time
 
 
 class Camera:
@@ -56,11 +51,13 @@ class Camera:
     Args:
       model: the scene
       data: its state
-      organ: that is drawn
+      organ: that is worked on; the model's others are drawn too
       prefix: of the instrument in the right hand
       sites: of targets
     """
-    self.model, self._data, self._organ, self._prefix = model, data, organ, prefix
+    self.model, self._data, self._prefix = model, data, prefix
+    others = [Organ(model, data, name) for name in instances(model) if name != organ.name]
+    self._organs = [Surface(model, each) for each in (organ, *others)]
     self._targets = len(sites)
     others = np.flatnonzero(model.site_group <= _SHOWN)
     self._sites = [*sites, *(int(site) for site in others if site not in sites)]
@@ -71,9 +68,8 @@ class Camera:
     self._sensors = [self._sensor(prefix + name) for name in _SENSORS]
     self._burnt = [self._sensor(f"{model.site(s).name}_force") for s in self._hooks]
     self._threads = [Thread(model, data, name) for name in instances(model, dim=1)]
-    self._whole, self.peak, self._begun = organ.elem, 0.0, 0.0
+    self.peak = self._begun = 0.0
     self._since = self._felt = None  # largest force since the last frame, and before [N]
-    self._follow()
 
   def _sensor(self, name: str) -> np.ndarray:
     sensor = self.model.sensor(name)
@@ -88,21 +84,23 @@ class Camera:
     return cls(*args, physics.target_sites)
 
   def shapes(self, **more: Any) -> dict[str, Any]:
-    """Returns what is drawn, JSON: organ, parts, scenery, lights, and what the caller adds."""
+    """Returns what is drawn, JSON: organs, parts, scenery, lights, and what the caller adds."""
     model, data = self.model, self._data
-    eye, used = self._eye, self._used()
-    textures = {t: _texture(model, t) for t in sorted({_paper(model, m) for m in used}) if t >= 0}
+    eye = self._eye
+    used = {*model.skin_matid.tolist(), *(each.material for each in self._organs)}
+    textures = {t: _texture(model, t) for t in sorted({paper(model, m) for m in used}) if t >= 0}
+    drawn = {each.organ.skin for each in self._organs}
     hooks = [self._bodies.index(int(model.site_bodyid[s])) for s in self._hooks]
     return {
       "type": "scene",
-      "nodes": self._organ.nvert,
-      "organ": self._surface(),
+      "nodes": self._organs[0].organ.nvert,
+      "organs": [each.shape() for each in self._organs],
       "parts": [
         {
           "body": self._bodies.index(body),
           "mine": self._mine(body),
           "shape": _shape(model, geoms),
-          "look": _look(model, *key),
+          "look": look(model, *key),
         }
         for (body, key), geoms in self._parts.items()
       ],
@@ -110,7 +108,7 @@ class Camera:
       "bodies": len(self._bodies),
       "scenery": [
         _skin(model, data, s) for s in range(model.nskin)
-        if s != self._organ.skin and model.skin_group[s] <= _SHOWN
+        if s not in drawn and model.skin_group[s] <= _SHOWN
       ],
       "sites": [_FORMS.get(int(model.site_type[s]), "ball") for s in self._sites],
       "targets": self._targets,
@@ -136,79 +134,17 @@ class Camera:
   def _thread(self, thread: Thread) -> dict[str, Any]:
     """Returns a thread: how many nodes it has, its radius [m], its look."""
     model, flex = self.model, mj.mj_name2id(self.model, mj.mjtObj.mjOBJ_FLEX, thread.name)
-    look = _look(model, int(np.ravel(model.flex_matid[flex])[0]), tuple(model.flex_rgba[flex]))
+    seen = look(model, int(np.ravel(model.flex_matid[flex])[0]), tuple(model.flex_rgba[flex]))
     radius = float(np.ravel(model.flex_radius[flex])[0])
-    return {"nodes": len(thread.positions), "radius": radius, "look": look}
+    return {"nodes": len(thread.positions), "radius": radius, "look": seen}
 
-  def _used(self) -> set[int]:
-    """Returns the materials of skins and of the organ."""
-    skins = self.model.skin_matid.tolist()
-    return {*skins, self._material()} - {-1}
-
-  def _material(self) -> int:
-    """Returns the organ's material, -1 for none."""
-    model, skin = self.model, self._organ.skin
-    if skin is not None:
-      return int(model.skin_matid[skin])
-    return int(np.ravel(model.flex_matid[self._flex()])[0])
-
-  def _flex(self) -> int:
-    return mj.mj_name2id(self.model, mj.mjtObj.mjOBJ_FLEX, self._organ.name)
-
-  def _surface(self) -> dict[str, Any]:
-    """Returns the organ: its look, its triangles, and the finer surface that is drawn for it."""
-    model, skin, flex = self.model, self._organ.skin, self._flex()
-    colour = model.skin_rgba[skin] if skin is not None else model.flex_rgba[flex]
-    walls = mj.mj_name2id(model, mj.mjtObj.mjOBJ_FLEX, f"{self._organ.name}_inside")
-    out = {
-      "look": _look(model, self._material(), tuple(colour)),
-      "inside": (model.flex_rgba[walls] if walls >= 0 else np.array([0.3, 0.05, 0.05])).tolist(),
-      "topology": self.topology(),
-    }
-    if skin is None or self._organ.elem is not self._whole:
-      return out
-    count = int(model.skin_vertnum[skin])
-    level = subdivide.LEVELS[subdivide.counts(self._whole).index(count)]
-    fine = subdivide.smooth(self._whole, level)
-    weight = _weights(self._whole.tobytes(), level)
-    rows = {name: pack(getattr(weight, name)) for name in ("indptr", "indices", "data")}
-    return out | {"smooth": rows | {"triangles": pack(fine.elem), "uv": self._uv()}}
-
-  def _uv(self) -> dict[str, str] | None:
-    """Returns where the vertices of what is drawn are on the organ's texture, None for none."""
-    model, skin, flex = self.model, self._organ.skin, self._flex()
-    if skin is not None:
-      adr = int(model.skin_texcoordadr[skin])
-      at = model.skin_texcoord[adr : adr + int(model.skin_vertnum[skin])]
-      return pack(at) if adr >= 0 else None
-    adr, first = int(model.flex_texcoordadr[flex]), int(model.flex_elemdataadr[flex])
-    if adr < 0:
-      return None
-    elem = self._organ.elem[: len(self._whole)]
-    corners = model.flex_elemtexcoord[first : first + elem.size]
-    out = np.zeros((self._organ.nvert, 2), np.float32)
-    out[elem.ravel()] = model.flex_texcoord[adr + corners]
-    return pack(out)
-
-  def _follow(self) -> None:
-    """Takes the organ's rest shape, which a cut changes."""
-    self._elem, self._rest = self._organ.elem, self._organ.xpos0
-
-  def cut(self) -> bool:
-    """Returns whether the organ was cut since it was looked at; see `topology`."""
-    return self._organ.elem is not self._elem
-
-  def topology(self) -> dict[str, Any]:
-    """Returns the triangles as they are now, JSON, where a cut has opened them, and places."""
-    self._follow()
-    solid = len(self._organ.tetrahedra) > 0
-    lips = np.zeros((0, 3)) if solid else _opened(self._whole, self._elem)
-    return {
-      "triangles": pack(self._elem),
-      "outer": len(self._whole),
-      "lips": pack(lips.astype(np.int32)),
-      "uv": self._uv(),
-    }
+  def cuts(self) -> list[dict[str, Any]]:
+    """Returns the triangles of the organs that were cut since they were looked at, JSON."""
+    return [
+      {"type": "topology", "organ": k, **each.topology()}
+      for k, each in enumerate(self._organs)
+      if each.cut()
+    ]
 
   def _mine(self, body: int) -> bool:
     """Whether a body goes where the tip goes: what hangs on the shaft's joint, not the port."""
@@ -222,9 +158,19 @@ class Camera:
     """Takes the largest force in a control step: that which warnings go by."""
     self._since = self._felt = max(self._since or 0.0, force)
 
+  def _nodes(self) -> list[np.ndarray]:
+    first, *others = self._organs
+    out = [first.places().ravel()]
+    for each in others:
+      places = each.places()
+      out += [places.ravel(), np.zeros(3 * (len(each.organ.displacement) - len(places)))]
+    return out
+
   def frame(self, link: Link, pace: Pace, progress: float = 0.0, powered: bool = False) -> bytes:
     """Returns a frame, float32: `HEAD`, nodes, threads, bodies (place, matrix), sites.
 
+    Nodes are those of the organ that is worked on, then those of the others, which have room for
+    all that cuts may add.
     A node of a thread has 4 numbers: place, and 1 where what follows it is whole, else 0. A site
     has 19: place, colour, size, matrix.
     """
@@ -245,7 +191,7 @@ class Camera:
     bodies, sites = self._bodies, self._sites
     parts = (
       head,
-      (self._rest + self._organ.displacement[: len(self._rest)]).ravel(),
+      *self._nodes(),
       *(np.column_stack([t.positions, np.r_[~t.broken, True]]).ravel() for t in self._threads),
       np.hstack([data.xpos[bodies], data.xmat[bodies]]).ravel(),
       np.hstack([
@@ -253,51 +199,6 @@ class Camera:
       ]).ravel(),
     )  # fmt: skip
     return np.concatenate(parts, dtype=np.float32, casting="unsafe").tobytes()
-
-
-def pack(values: np.ndarray) -> dict[str, str]:
-  """Returns numbers as JSON, base64: `f` are 32 bit floats, `b`, `h` and `u` 8, 16 and 32 bits."""
-  if values.dtype.kind == "f":
-    letter, kind = "f", np.float32
-  else:
-    most = int(values.max(initial=0)) if values.dtype != np.uint8 else 0
-    letter, kind = next(
-      (name, kind)
-      for name, kind in (("b", np.uint8), ("h", np.uint16), ("u", np.uint32))
-      if most <= np.iinfo(kind).max
-    )
-  return {letter: base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()}
-
-
-@functools.lru_cache(maxsize=4)
-def _weights(content: bytes, level: int) -> csr_array:
-  """Returns what an organ's vertices count in each of its skin's, without what is next to nothing.
-
-  The weights of a fine vertex add up to 1.
-  """
-  elem = np.frombuffer(content, np.int32).reshape(-1, 3)
-  fine, count = subdivide.smooth(elem, level), int(elem.max()) + 1
-  columns = []
-  for first in range(0, count, _CHUNK):
-    unit = np.eye(count, min(_CHUNK, count - first), -first)
-    weight = fine(unit).T
-    columns.append(csr_array(np.where(np.abs(weight) > _TINY, weight, 0.0)))
-  out = csr_array(vstack(columns).T)
-  out.data /= np.repeat(np.asarray(out.sum(axis=1)).ravel(), np.diff(out.indptr))
-  return out
-
-
-def _opened(whole: np.ndarray, elem: np.ndarray) -> np.ndarray:
-  """Returns the edges that cuts have opened: start, end and opposite vertex  (n, 3)."""
-
-  def alone(t: np.ndarray) -> np.ndarray:
-    tail, head, n = t.ravel(), np.roll(t, -1, axis=1).ravel(), int(t.max()) + 1
-    return ~np.isin(head.astype(np.int64) * n + tail, tail.astype(np.int64) * n + head)
-
-  if elem is whole:
-    return np.zeros((0, 3), int)
-  half = np.flatnonzero(alone(elem) & ~alone(whole))
-  return np.stack([elem[half // 3, (half + k) % 3] for k in range(3)], axis=1)
 
 
 def _parts(model: mj.MjModel) -> dict[tuple[int, tuple], list[int]]:
@@ -356,28 +257,6 @@ _FORMS = {
 }
 
 
-def _paper(model: mj.MjModel, material: int) -> int:
-  """Returns the texture of a material, -1 for none that lies flat on a surface."""
-  if material < 0:
-    return -1
-  texture = int(model.mat_texid[material, mj.mjtTextureRole.mjTEXROLE_RGB])
-  flat = texture >= 0 and model.tex_type[texture] == mj.mjtTexture.mjTEXTURE_2D
-  return texture if flat else -1
-
-
-def _look(model: mj.MjModel, material: int, rgba: Sequence[float]) -> dict[str, Any]:
-  """Returns what a surface looks like: a material, where a colour of its own does not count."""
-  if material < 0:
-    return {"rgba": [round(float(c), 3) for c in rgba], "specular": 0.5, "shininess": 0.5}
-  return {
-    "rgba": [round(float(c), 3) for c in model.mat_rgba[material]],
-    "specular": float(model.mat_specular[material]),
-    "shininess": float(model.mat_shininess[material]),
-    "texture": _paper(model, material),
-    "repeat": model.mat_texrepeat[material].tolist(),
-  }
-
-
 def _texture(model: mj.MjModel, texture: int) -> dict[str, Any]:
   height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
   channels, adr = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
@@ -398,15 +277,27 @@ def _skin(model: mj.MjModel, data: mj.MjData, skin: int) -> dict[str, Any]:
     "vertices": pack(own @ data.xmat[body].reshape(3, 3).T + data.xpos[body]),
     "triangles": pack(model.skin_face[face : face + faces]),
     "uv": pack(model.skin_texcoord[at : at + count]) if at >= 0 else None,
-    "look": _look(model, int(model.skin_matid[skin]), model.skin_rgba[skin]),
+    "look": look(model, int(model.skin_matid[skin]), model.skin_rgba[skin]),
   }
 
 
 def _lights(model: mj.MjModel, data: mj.MjData) -> list[dict[str, Any]]:
-  """Returns the lights; `around` is what all of them and the headlight give to every surface."""
+  """Returns the lights; `around` is what all of them and the headlight give to every surface.
+
+  Where no lamp is at the lens, the headlight is that lamp.
+  """
   head, every = model.vis.headlight, []
+  lit = any(model.light(k).name == LIGHT for k in range(model.nlight))
   if head.active:
-    every.append({"pos": None, "colour": np.array(head.diffuse), "around": np.array(head.ambient)})
+    eye = model.camera("laparoscope").id
+    every.append({
+      "pos": None if lit else data.cam_xpos[eye],
+      "dir": -data.cam_xmat[eye].reshape(3, 3)[:, 2],
+      "directed": True,
+      "lens": True,
+      "colour": np.array(head.diffuse),
+      "around": np.array(head.ambient),
+    })
   for k in range(model.nlight):
     directed = model.light_type[k] == mj.mjtLightType.mjLIGHT_DIRECTIONAL
     every.append({

@@ -6,6 +6,8 @@ export class Plot {
     this.canvas = document.getElementById(`plot-${name}`);
     this.text = document.getElementById(`text-${name}`);
     this.values = [];
+    this.size = [0, 0];
+    new ResizeObserver(() => this.size = [this.canvas.clientWidth, this.canvas.clientHeight]).observe(this.canvas);
   }
 
   push(value) {
@@ -19,8 +21,7 @@ export class Plot {
 
   // `least` is what the axis spans at least.
   draw(limit, digits = 2, least = 1e-3) {
-    const {canvas, values} = this, pen = canvas.getContext("2d"), scale = devicePixelRatio || 1;
-    const width = canvas.clientWidth, height = canvas.clientHeight;
+    const {canvas, values, size: [width, height]} = this, pen = canvas.getContext("2d"), scale = devicePixelRatio || 1;
     if (!width) return;
     if (canvas.width !== Math.round(width * scale)) {
       [canvas.width, canvas.height] = [Math.round(width * scale), Math.round(height * scale)];

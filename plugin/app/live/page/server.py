@@ -34,7 +34,7 @@ _KINDS = {
 # What is served, and nothing else: the page's own files, three.js and the pictures of the cards.
 _FILES = {"/": _HERE / "page.html"} | {
   f"/{path.relative_to(_HERE).as_posix()}": path
-  for path in (*_HERE.glob("*"), *_HERE.glob("three/*.js"), *_HERE.glob("cards/*"))
+  for path in _HERE.rglob("*")
   if path.suffix in _KINDS and path.name != "page.html"
 }
 _LARGEST = 4096  # message from a page [bytes]

@@ -342,8 +342,8 @@ class Worker:
 
   def _follow(self, camera: Camera) -> None:
     """Tells of triangles that a cut has changed."""
-    if camera.cut():
-      self._tell({"type": "topology", **camera.topology()})
+    for message in camera.cuts():
+      self._tell(message)
 
   def _feel(self, env: Any) -> None:
     """Takes the force of a control step, of which there are more than frames."""

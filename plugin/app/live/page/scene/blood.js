@@ -1,5 +1,5 @@
 // What cuts and currents leave on tissue: beads of blood that grow and run down, and char. Drawn only.
-import * as THREE from "./three/three.module.min.js";
+import * as THREE from "../three/three.module.min.js";
 
 const MOST = 200;  // beads and spots of char
 const VESSELS = 4;  // of so many vertices of a cut one bleeds

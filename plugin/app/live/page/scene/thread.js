@@ -1,5 +1,5 @@
 // A thread as a tube, round and smooth through its nodes.
-import * as THREE from "./three/three.module.min.js";
+import * as THREE from "../three/three.module.min.js";
 import {cross, dot, scale, sub, unit} from "./vectors.js";
 
 const SIDES = 8, PIECES = 4;  // around, and from node to node

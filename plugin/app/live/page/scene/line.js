@@ -1,5 +1,5 @@
 // A line that somebody draws on the organ with the pointer, to follow or to cut along: it goes with the tissue.
-import * as THREE from "./three/three.module.min.js";
+import * as THREE from "../three/three.module.min.js";
 import {cross, dot} from "./vectors.js";
 
 const MOST = 600, STEP = 0.0012, DOT = 7e-4;  // dots; between two, and of one [m]

@@ -1,28 +1,32 @@
 // Draws a scene: tissue that moves, scenery that does not, instruments and marks. The server says where
 // things are; what a laparoscope adds to that, its lamp, wet surfaces and smoke, is made here.
-import * as THREE from "./three/three.module.min.js";
+import * as THREE from "../three/three.module.min.js";
 import {Blood} from "./blood.js";
+import {creased, normals, shape, unpack} from "./geometry.js";
 import {Line} from "./line.js";
+import {Organ} from "./organ.js";
 import {Thread} from "./thread.js";
-import {add, cross, dot, scale, sub, unit} from "./vectors.js";
+import {add, dot, scale, sub} from "./vectors.js";
 
 const NODE = 4, BODY = 12, SITE = 19;  // numbers of a thread's node, a body and a site in a frame
-const LIP = 8e-4;  // width of the edge of a cut [m]
 const BESIDE = 0.006;  // from the lens to its lamp [m]
 const EXPERT = 0x59f2bf;
 const SHADES = 4, DARK = 0.6, SOFT = 0.006, LONG = 0.05;  // contact shadows: most, depth, reach [m], length of shaft [m]
 const PUFFS = 24, LASTS = 1.6;  // of smoke, and how long [s]
 const NEAR = 0.005, FAR = 2;  // [m]
+// Light is added up on colours as they are, as MuJoCo's renderer does: tissue looks as in the films.
+THREE.ColorManagement.enabled = false;
 // A scene's lights fade as MuJoCo's do, a + b d^2; `distance` and `decay` of a light carry a and b.
 THREE.ShaderChunk.lights_pars_begin = THREE.ShaderChunk.lights_pars_begin.replace(
   /(float getDistanceAttenuation\([^{]*\{)[\s\S]*?\n}/,
   "$1\n\treturn 1.0 / (cutoffDistance + decayExponent * lightDistance * lightDistance);\n}",
 );
 
-// Returns the parts of a frame: the organ's nodes, threads' nodes, bodies and sites.
-export function parts({head, threads, bodies, sites}, frame) {
+// Returns the parts of a frame: the nodes of the first organ and of all others, threads' nodes, bodies and sites.
+export function parts({head, organs, threads, bodies, sites}, frame) {
   const strands = threads.reduce((sum, {nodes}) => sum + NODE * nodes, 0);
-  const sizes = [strands, BODY * bodies, SITE * sites.length], free = frame.length - sizes.reduce((a, b) => a + b, head.length);
+  const others = organs.slice(1).reduce((sum, {count}) => sum + 3 * count, 0);
+  const sizes = [others, strands, BODY * bodies, SITE * sites.length], free = frame.length - sizes.reduce((a, b) => a + b, head.length);
   let at = head.length;
   return [free, ...sizes].map(size => frame.subarray(at, at += size));
 }
@@ -34,6 +38,7 @@ export class View {
     this.slow = drawnByProcessor() && !wet;
     this.patient = wet;  // however long a picture takes
     this.gl = new THREE.WebGLRenderer({canvas, antialias: !this.slow, powerPreference: "high-performance"});
+    this.gl.outputColorSpace = THREE.LinearSRGBColorSpace;
     this.gl.toneMapping = THREE.NeutralToneMapping;
     this.gl.toneMappingExposure = 1.15;
     this.camera = new THREE.PerspectiveCamera(45, 1, NEAR, FAR);
@@ -41,6 +46,8 @@ export class View {
     this.wire = this.free = this.pen = false;
     this.wet = !this.slow;  // wet tissue and mirrors, or what is fast to draw
     this.mirror = this.wet ? reflections(this.gl) : null;
+    this.size = [canvas.clientWidth, canvas.clientHeight];
+    new ResizeObserver(() => this.size = [canvas.clientWidth, canvas.clientHeight]).observe(canvas);
     this.home();
   }
 
@@ -53,9 +60,9 @@ export class View {
 
   // What the picture depends on beside the frame.
   state() {
-    const {canvas, wire, free, turn, shift, zoom, smoke, blood, line} = this;
+    const {size, wire, free, turn, shift, zoom, smoke, blood, line} = this;
     const smoking = smoke?.some(puff => puff.visible) || blood?.flows ? performance.now() : 0;
-    return JSON.stringify([canvas.clientWidth, canvas.clientHeight, wire, free, turn, shift, zoom, smoking, line?.points.length]);
+    return JSON.stringify([size, wire, free, turn, shift, zoom, smoking, line?.points.length]);
   }
 
   scale(factor) {
@@ -75,7 +82,6 @@ export class View {
     });
     this.papers?.forEach(paper => paper.dispose());
     this.scene = scene;
-    this.elem = this.lips = this.opened = null;
     this.shades = {value: scene.tips.slice(0, SHADES).flatMap(() => [new THREE.Vector3(9, 9, 9), new THREE.Vector3(9, 9, 9)])};
     this.world = new THREE.Scene();
     this.world.background = new THREE.Color(0x120505);
@@ -84,7 +90,7 @@ export class View {
     for (const light of scene.lights) {
       const made = lamps(light);
       this.world.add(...made);
-      if (light.lens) this.lenses.push(made[1]);
+      if (light.pos && light.lens) this.lenses.push(made[1]);
     }
     for (const each of scene.scenery) {
       const material = this.surface(each.look);
@@ -106,7 +112,8 @@ export class View {
     this.threads = scene.threads.map(({nodes, radius, look}) => new Thread(this.world, nodes, radius, this.surface(look, true)));
     this.blood = new Blood(this.world, this.wet);
     this.line = new Line(this.world);
-    this.weave(scene.organ);
+    const tissue = (look, side) => shade(this.surface(look, false, side), this.shades);
+    this.organs = scene.organs.map(each => new Organ(this.world, each, tissue));
     this.lead();
     this.smoke = Array.from({length: PUFFS}, () => {
       const puff = new THREE.Sprite(new THREE.SpriteMaterial({map: cloud(), transparent: true, depthWrite: false, color: 0xd8d4d0}));
@@ -117,52 +124,10 @@ export class View {
     this.puffed = this.blown = 0;
   }
 
-  // The organ: what is drawn for it, its mesh, and what cuts have opened.
-  weave({look, inside, topology, smooth}) {
-    const material = shade(this.surface(look, false, smooth ? THREE.FrontSide : THREE.DoubleSide), this.shades);
-    this.inside = new THREE.Color().setRGB(...inside.slice(0, 3), THREE.SRGBColorSpace);
-    this.smooth = smooth && {
-      from: unpack(smooth.indptr), nodes: unpack(smooth.indices), share: unpack(smooth.data), count: unpack(smooth.indptr).length - 1,
-    };
-    this.organ = new THREE.Mesh(new THREE.BufferGeometry(), material);
-    this.organ.frustumCulled = false;
-    if (smooth) {
-      this.organ.geometry.setIndex(new THREE.BufferAttribute(unpack(smooth.triangles), 1));
-      put(this.organ.geometry, "position", 3 * this.smooth.count);
-      if (smooth.uv) this.organ.geometry.setAttribute("uv", new THREE.BufferAttribute(unpack(smooth.uv), 2));
-    }
-    this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshBasicMaterial({wireframe: true, color: 0xf0b8a0}));
-    const wall = this.surface({rgba: [1, 1, 1, 1], specular: 0.7, shininess: 0.8}, false, THREE.DoubleSide);
-    wall.color.copy(this.inside);
-    this.walls = new THREE.Mesh(new THREE.BufferGeometry(), shade(wall, this.shades));
-    this.mesh.frustumCulled = this.walls.frustumCulled = false;
-    this.world.add(this.organ, this.mesh, this.walls);
-    this.sew(topology);
-  }
-
-  // Takes the triangles of the organ; after a cut its own surface is drawn, for a skin knows of no cut.
-  sew({triangles, outer, lips, uv}) {
-    const elem = unpack(triangles), whole = this.elem;
-    const before = new Set([...this.lips ?? [], ...this.opened ?? []]);
-    this.lips = unpack(lips);
-    this.elem = elem.subarray(0, 3 * outer);
-    this.opened = elem.subarray(3 * outer);
-    const cut = this.lips.length > 0 || this.opened.length > 0;
-    if (cut) this.smooth = null;
-    if (whole) this.blood.open([...this.lips, ...this.opened].filter(v => !before.has(v)));
-    this.mesh.geometry.setIndex(new THREE.BufferAttribute(this.elem, 1));
-    if (this.smooth) return;
-    if (this.organ.geometry.index) {
-      this.organ.geometry.dispose();
-      this.organ.geometry = new THREE.BufferGeometry();
-      this.organ.material.side = THREE.DoubleSide;
-      this.organ.material.needsUpdate = true;
-    }
-    this.organ.geometry.setIndex(new THREE.BufferAttribute(this.elem, 1));
-    if (uv) this.organ.geometry.setAttribute("uv", new THREE.BufferAttribute(unpack(uv), 2));
-    const n = this.lips.length / 3, quads = [];
-    for (let i = 0; i < n; i++) quads.push(4 * i, 4 * i + 1, 4 * i + 2, 4 * i, 4 * i + 2, 4 * i + 3);
-    this.walls.geometry.setIndex(n ? quads : new THREE.BufferAttribute(this.opened, 1));
+  // Takes the triangles of an organ that was cut.
+  sew({organ, ...topology}) {
+    const opened = this.organs[organ].sew(topology);
+    if (organ === 0) this.blood.open(opened);
   }
 
   // What shows the expert: the instrument, and its path.
@@ -180,7 +145,7 @@ export class View {
 
   // Returns how a surface is drawn, tissue or an instrument's.
   surface({rgba, specular, shininess, texture, repeat}, hard = false, side = THREE.FrontSide) {
-    const color = new THREE.Color().setRGB(rgba[0], rgba[1], rgba[2], THREE.SRGBColorSpace);
+    const color = new THREE.Color().setRGB(rgba[0], rgba[1], rgba[2]);
     const map = this.papers.get(texture) ?? null, metal = hard && specular > 0.85;
     if (map && repeat) map.repeat.set(...repeat);
     const common = {color, map, side, transparent: rgba[3] < 1, opacity: rgba[3]};
@@ -214,10 +179,13 @@ export class View {
 
   // Draws a frame: its numbers, and those at its head by name.
   draw(frame, head, expert) {
-    const {scene, canvas, camera} = this, width = canvas.clientWidth, height = canvas.clientHeight;
-    let from = 0;
-    this.gl.setPixelRatio(this.fine);
-    this.gl.setSize(width, height, false);
+    const {scene, camera, size: [width, height]} = this, pixels = [width, height, this.fine].join();
+    let from = 0, first = 0;
+    if (pixels !== this.pixels) {  // each time the browser makes room anew
+      this.gl.setPixelRatio(this.fine);
+      this.gl.setSize(width, height, false);
+      this.pixels = pixels;
+    }
     this.follow(frame);
     const {at, axes, fovy} = this.eye([head.tip_x, head.tip_y, head.tip_z]);
     camera.fov = fovy;
@@ -225,8 +193,10 @@ export class View {
     camera.updateProjectionMatrix();
     camera.matrix.makeBasis(...axes.map(axis => new THREE.Vector3(...axis))).setPosition(...at);
     camera.matrixWorldNeedsUpdate = true;
-    const [nodes, threads, bodies, sites] = parts(scene, frame);
-    this.drape(nodes);
+    const [nodes, others, threads, bodies, sites] = parts(scene, frame), [organ, ...more] = this.organs;
+    this.nodes = nodes;
+    organ.drape(nodes, this.wire);
+    for (const each of more) each.drape(others.subarray(first, first += each.count), this.wire);
     for (const thread of this.threads) thread.drape(threads.subarray(from, from += NODE * thread.nodes));
     this.darken(bodies);
     for (const part of this.parts) {
@@ -251,37 +221,6 @@ export class View {
       lamp.position.set(...add(camera.pos, scale(right, BESIDE)));
       lamp.target.position.set(...sub(lamp.position.toArray(), back));
     }
-  }
-
-  // Lays the surfaces over the organ's nodes.
-  drape(nodes) {
-    const {organ, mesh, walls, smooth, wire} = this;
-    organ.visible = !wire;
-    mesh.visible = wire;
-    if (wire) fill(mesh.geometry, nodes, null);
-    this.nodes = nodes;
-    if (smooth) {
-      const out = organ.geometry.attributes.position.array, {from, nodes: near, share, count} = smooth;
-      for (let i = 0; i < count; i++) {
-        let x = 0, y = 0, z = 0;
-        for (let k = from[i]; k < from[i + 1]; k++) {
-          const j = 3 * near[k], s = share[k];
-          x += s * nodes[j];
-          y += s * nodes[j + 1];
-          z += s * nodes[j + 2];
-        }
-        out[3 * i] = x;
-        out[3 * i + 1] = y;
-        out[3 * i + 2] = z;
-      }
-      fill(organ.geometry, out, organ.geometry.index.array);
-    } else {
-      fill(organ.geometry, nodes, this.elem);
-    }
-    walls.visible = !wire && (this.lips.length > 0 || this.opened.length > 0);
-    if (!walls.visible) return;
-    if (this.lips.length) fill(walls.geometry, ribbons(this.lips, nodes), walls.geometry.index.array);
-    else fill(walls.geometry, nodes, this.opened);
   }
 
   // Where instruments are close to tissue, that is darker: their tips, and the shafts above them.
@@ -344,16 +283,16 @@ export class View {
 
   // Draws on to the organ where a pointer is, in pixels of the page.
   write({clientX, clientY}) {
-    const {canvas, camera, nodes, elem, line} = this, box = canvas.getBoundingClientRect();
+    const {canvas, camera, nodes, line} = this, box = canvas.getBoundingClientRect();
     const x = 2 * (clientX - box.left) / box.width - 1, y = 1 - 2 * (clientY - box.top) / box.height;
     const from = new THREE.Vector3().setFromMatrixPosition(camera.matrix);
     const to = new THREE.Vector3(x, y, 0.5).applyMatrix4(camera.projectionMatrixInverse).applyMatrix4(camera.matrix);
-    if (nodes) line.add(from.toArray(), to.sub(from).toArray(), nodes, elem);
+    if (nodes) line.add(from.toArray(), to.sub(from).toArray(), nodes, this.organs[0].elem);
   }
 
   // Blood and char go with the vertices of the mesh; what is drawn smooth lies close to these.
   stain() {
-    const {blood, nodes, elem} = this, {length} = nodes;
+    const {blood, nodes} = this, {elem} = this.organs[0], {length} = nodes;
     if (!blood.wounds.size && !blood.burns.size) return;
     if (this.outward?.length !== length) this.outward = new Float32Array(length);
     normals(nodes, elem, this.outward);
@@ -378,13 +317,6 @@ function drawnByProcessor() {
   return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
-// Arrays as the server packs them, see `pack` in picture.py.
-const KINDS = {f: Float32Array, b: Uint8Array, h: Uint16Array, u: Uint32Array};
-function unpack(packed) {
-  const [[kind, text]] = Object.entries(packed), bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
-  return new KINDS[kind](bytes.buffer);
-}
-
 // What marks are drawn as, of unit size.
 const FORMS = {ball: new THREE.SphereGeometry(1, 20, 14), box: new THREE.BoxGeometry(2, 2, 2)};
 FORMS.ellipsoid = FORMS.ball;
@@ -401,99 +333,13 @@ function place(mark, n) {
   const [a, b, c] = n.subarray(7, 10), sizes = {ball: [a, a, a], cylinder: [a, a, b]};
   mark.matrix.scale(new THREE.Vector3(...sizes[mark.userData] ?? [a, b, c]));
   mark.matrixWorldNeedsUpdate = true;
-  mark.material.color.setRGB(n[3], n[4], n[5], THREE.SRGBColorSpace);
+  mark.material.color.setRGB(n[3], n[4], n[5]);
   mark.material.emissive.copy(mark.material.color).multiplyScalar(0.35);
   mark.material.opacity = n[6];
 }
 
 function rigid([x, y, z], [w, a, b, c]) {
   return new THREE.Matrix4().makeRotationFromQuaternion(new THREE.Quaternion(a, b, c, w)).setPosition(x, y, z);
-}
-
-// Geometries. A vertex's numbers change in place.
-function put(geometry, name, length) {
-  const held = geometry.attributes[name];
-  if (held?.array.length === length) return held;
-  const made = new THREE.BufferAttribute(new Float32Array(length), 3);
-  made.setUsage(THREE.DynamicDrawUsage);
-  geometry.setAttribute(name, made);
-  return made;
-}
-function fill(geometry, places, triangles) {
-  const position = put(geometry, "position", places.length);
-  if (position.array !== places) position.array.set(places);
-  position.needsUpdate = true;
-  if (!triangles) return;
-  const normal = put(geometry, "normal", places.length);
-  normals(places, triangles, normal.array);
-  normal.needsUpdate = true;
-}
-function shape({vertices, triangles, uv}) {
-  const geometry = new THREE.BufferGeometry(), places = unpack(vertices), elem = unpack(triangles);
-  geometry.setIndex(new THREE.BufferAttribute(elem, 1));
-  fill(geometry, places, elem);
-  if (uv) geometry.setAttribute("uv", new THREE.BufferAttribute(unpack(uv), 2));
-  return geometry;
-}
-
-// The same with edges where faces meet at more than 35 degrees: hard things have some.
-function creased(geometry) {
-  const flat = geometry.toNonIndexed(), {array} = flat.attributes.position, n = array.length / 9, near = new Map();
-  const face = new Float32Array(3 * n);
-  for (let i = 0; i < n; i++) {
-    const [u, v] = [1, 2].map(k => [0, 1, 2].map(j => array[9 * i + 3 * k + j] - array[9 * i + j]));
-    face.set(unit(cross(u, v)), 3 * i);
-    for (let k = 0; k < 3; k++) {
-      const key = [0, 1, 2].map(j => Math.round(1e6 * array[9 * i + 3 * k + j])).join();
-      if (!near.has(key)) near.set(key, []);
-      near.get(key).push(i);
-    }
-  }
-  const normal = new Float32Array(array.length);
-  for (let v = 0; v < 3 * n; v++) {
-    const i = Math.floor(v / 3), key = [0, 1, 2].map(j => Math.round(1e6 * array[3 * v + j])).join();
-    for (const k of near.get(key)) {
-      const same = face[3 * i] * face[3 * k] + face[3 * i + 1] * face[3 * k + 1] + face[3 * i + 2] * face[3 * k + 2];
-      if (same > 0.82) for (let j = 0; j < 3; j++) normal[3 * v + j] += face[3 * k + j];
-    }
-  }
-  flat.setAttribute("normal", new THREE.BufferAttribute(normal, 3));
-  flat.normalizeNormals();
-  return flat;
-}
-
-// Quads along opened edges: start, end, and both moved into their triangle.
-function ribbons(lips, x) {
-  const out = new Float32Array(4 * lips.length);
-  for (let i = 0; i < lips.length; i += 3) {
-    const [a, b, c] = [0, 1, 2].map(k => [0, 1, 2].map(j => x[3 * lips[i + k] + j]));
-    const along = sub(b, a), side = sub(c, a), inward = sub(side, scale(along, dot(side, along) / Math.max(dot(along, along), 1e-12)));
-    const step = scale(inward, LIP / Math.max(Math.hypot(...inward), 1e-9));
-    [a, b, add(b, step), add(a, step)].forEach((p, k) => out.set(p, 4 * i + 3 * k));
-  }
-  return out;
-}
-
-function normals(x, t, out) {
-  out.fill(0);
-  for (let i = 0; i < t.length; i += 3) {
-    const a = 3 * t[i], b = 3 * t[i + 1], c = 3 * t[i + 2];
-    const u0 = x[b] - x[a], u1 = x[b + 1] - x[a + 1], u2 = x[b + 2] - x[a + 2];
-    const v0 = x[c] - x[a], v1 = x[c + 1] - x[a + 1], v2 = x[c + 2] - x[a + 2];
-    const l = u1 * v2 - u2 * v1, m = u2 * v0 - u0 * v2, n = u0 * v1 - u1 * v0;
-    for (let k = 0; k < 3; k++) {
-      const at = 3 * t[i + k];
-      out[at] += l;
-      out[at + 1] += m;
-      out[at + 2] += n;
-    }
-  }
-  for (let i = 0; i < out.length; i += 3) {
-    const size = Math.hypot(out[i], out[i + 1], out[i + 2]) || 1;
-    out[i] /= size;
-    out[i + 1] /= size;
-    out[i + 2] /= size;
-  }
 }
 
 // Darkens a surface softly near the capsules of `shades`: pairs of ends, in the world.
@@ -526,7 +372,6 @@ function paper({width, height, pixels}, fine) {
   const rgb = unpack(pixels), rgba = new Uint8Array(4 * width * height).fill(255);
   for (let i = 0; i < width * height; i++) rgba.set(rgb.subarray(3 * i, 3 * i + 3), 4 * i);
   const texture = new THREE.DataTexture(rgba, width, height);
-  texture.colorSpace = THREE.SRGBColorSpace;
   texture.wrapS = texture.wrapT = THREE.RepeatWrapping;
   texture.magFilter = THREE.LinearFilter;
   texture.minFilter = fine ? THREE.LinearMipmapLinearFilter : THREE.LinearMipmapNearestFilter;
