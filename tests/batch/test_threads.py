@@ -81,8 +81,13 @@ def test_a_thread_around_a_drum_obeys_the_capstan_law(device, cone, kind):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_thread_over_an_organ_is_borne_by_it(device):
-  """Its weight and two loads are the organ's contact force."""
+  """Its weight and two loads are the organ's contact force.
+
+  By MuJoCo's own tolerance its normals of edges on triangles are up to 1.5 degrees off, which
+  swings the ends by 0.2 to 1.2 mm.
+  """
   spec = one.draped()
+  spec.option.ccd_tolerance, spec.option.ccd_iterations = 1e-9, 200
   model, data, thread, worlds = scene(spec, device)
   for end in (0, 56):
     load(model, data, worlds, end, (0, 0, -0.01))
@@ -92,7 +97,7 @@ def test_a_thread_over_an_organ_is_borne_by_it(device):
   force = organ.contact_force.numpy()[:, :, 2].sum(axis=1)
   np.testing.assert_allclose(force, -weight, rtol=0.01)
   assert np.abs(organ.xpos.numpy() - alone.xpos[: organ.nvert]).max() < 2e-5  # dented by 0.8 mm
-  assert off(thread, worlds) < 5e-4  # of its ends, which swing
+  assert off(thread, worlds) < 2e-4  # of its ends, which swing
   assert not worlds.overflow.numpy().any()
   there = mujoco.MjData(model)
   worlds.get_state(0, there)
