@@ -31,7 +31,7 @@ UPDATES, WORLDS = 128, 32  # steps of the optimiser of an iteration, and worlds 
 _KEPT = 8  # iterations that are learned from
 _ALONE = 1 / 3  # share of worlds where the student acts alone, once it acts
 _TURN = 40  # control steps of a turn elsewhere, in the mean
-_STUCK = 40  # control steps without progress after which it is the teacher's turn there
+STUCK = 40  # control steps without progress after which it is the teacher's turn there
 PATIENCE = 120  # control steps without progress that end an episode: nothing new is seen
 _LITTLE = 1e-3  # that is no progress [-]
 _ACTS, _LEAST = 0.4, 0.2  # share of the training after which the teacher acts least, and how often
@@ -190,7 +190,7 @@ class Distillation(Student):
       drawn = torch.rand(2, env.num_envs, generator=self._random, device=env.device)
       again = over.bool() | (drawn[0] < 1 / _TURN)
       self._helped = torch.where(again, drawn[1] < helps, self._helped)
-      self._helped |= self._idle > _STUCK
+      self._helped |= self._idle > STUCK
       if self._left:
         self._helped &= ~self._alone
     return {name: torch.stack(values) for name, values in rows.items()} | {"state": first[None]}
