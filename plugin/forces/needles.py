@@ -356,6 +356,7 @@ class Needles(Force):
       hole[HOLE.kind] = (_INTO if against else _OUT) if solid else _THROUGH
       hole[HOLE.elem : HOLE.elem + 3] = seat
       hole[HOLE.thread] = place
+    self.fields.solve.quiet.numpy()[0] = 0.0  # an organ that slept does so no longer
 
   def refresh(self, tissue: np.ndarray | None = None, thickness: Any = None):
     """Takes the material that there is now.
