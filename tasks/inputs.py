@@ -40,6 +40,9 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "ring_time": (),
   "ring_force": (),
   "bite": (),
+  "gap": (),
+  "tension": (),
+  "torn": (),
 }
 # Those that are measured faster: with substeps, magnitudes, one for each since the last sample.
 SIGNALS = ("force", "grip_force", "shaft_force", "surroundings_force")

@@ -220,7 +220,8 @@ class Recorder:
         that one was on so far [s], and `idle_current` without touching what it is to free [s];
         `regrasped`, how often the needle was taken so far, `ring_time`, how long rings were touched
         [s], and `ring_force`, with how much at most [N]; `bite`, how deep a needle went under a
-        wall [m]
+        wall [m]; `gap`, of a cut at its widest [m], `tension`, largest of a thread [N], `torn`, how
+        far a hole of it has torn [m]
     """
     time = float(time)
     if not (math.isfinite(time) and time > self._last):

@@ -81,6 +81,8 @@ class Common:
   hole_count: ints("nworld", "nneedle")
   hole_rest: floats("nworld", "nneedle", HOLES, 3)  # [m]
   hole_along: floats("nworld", "nneedle", HOLES)  # [m]
+  hole_torn: floats("nworld", "nneedle", HOLES)  # [m]
+  tension: floats("nworld", "nedge")  # of each edge of the thread [N]
   # Of the other hand.
   other_tip_pos: floats("nworld", 3)
   other_tip_quat: floats("nworld", 4)

@@ -147,6 +147,21 @@ def pinhole(s: Common, k: int):
 
 
 @word
+def torn_at(s: Common, k: int):
+  """See `rules`."""
+  return s.hole_torn[s.world, 0, k]
+
+
+@word
+def taut(s: Common):
+  """See `rules`."""
+  most = s.tension[s.world, 0]
+  for k in range(1, s.tension.shape[1]):
+    most = wp.max(most, s.tension[s.world, k])
+  return most
+
+
+@word
 def lens(s: Common):
   """See `rules`."""
   return tip(s)

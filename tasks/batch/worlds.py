@@ -128,6 +128,7 @@ class Worlds:
       naction=len(task.components), naxis=len(names), ncontrol=len(names) + 1,
       nside=model.ngeom + 1, nspot=len(getattr(task, "disc", ())), nbond=len(physics.organ.bonds),
       ncutter=len(physics.organ.cutters), nneedle=len(physics.organ.needles),
+      nedge=len(physics.thread.tension) if physics.thread else 0,
     )  # fmt: skip
     s = allocate(Common, self.device, sizes)
     s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
@@ -209,7 +210,10 @@ class Worlds:
       self.batch.poses()  # by which holes tell how far along the needle they are
       found = organ.needles
       s.needle_force, s.hole_count = found.force, found.count
-      s.hole_rest, s.hole_along = found.hole_rest, found.hole_along
+      s.hole_rest, s.hole_along, s.hole_torn = found.hole_rest, found.hole_along, found.hole_torn
+    if s.tension.shape[1]:
+      (thread,) = self.batch.threads.values()
+      s.tension = thread.tension
 
   # Doing.
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import mujoco as mj
 import numpy as np
-from palpate import Organ
+from palpate import Organ, Thread
 from palpate.models import laparoscope
 from palpate.tissue.config import Config
 from scipy.spatial import cKDTree
@@ -36,6 +36,7 @@ class Physics(Instrument, Portable):
   Attributes:
     second: the instrument of the other hand, None where there is none
     guided: an instrument that the exercise itself moves, in nobody's hand; None for none
+    thread: the scene's thread, None for none
     looked: where `look_from` has put the laparoscope, and its orientation; None where it stands
     eyes: what draws pictures without OpenGL, once it did
     meanwhile: called in the middle of every `step`, with what need not be done at its end, where a
@@ -45,6 +46,7 @@ class Physics(Instrument, Portable):
   second: Second | None = None
   guided: Second | None = None
   looked: np.ndarray | None = None
+  thread: Thread | None = None
   eyes: Any = None
   meanwhile: Callable[[], None] | None = None
 
@@ -67,6 +69,10 @@ class Physics(Instrument, Portable):
     if model is not self.model.ptr:
       self._reload_from_model(wrap(model))
     self.organ = Organ(model, self.data.ptr, organ)
+    threads = [
+      mj.mj_id2name(model, mj.mjtObj.mjOBJ_FLEX, k) for k in np.flatnonzero(model.flex_dim == 1)
+    ]
+    self.thread = Thread(model, self.data.ptr, threads[0]) if threads else None
     self._nodes: np.ndarray | None = None
     self._points: dict[int, np.ndarray] = {}
     self._camera = model.camera(CAMERA).id

@@ -279,6 +279,16 @@ def pinhole(s: Any, k: int) -> tuple[np.ndarray, float]:
   return hole.rest, float(hole.along)
 
 
+def torn_at(s: Any, k: int) -> float:
+  """Returns how far one of these has torn through the tissue [m]."""
+  return float(s.organ.needles[0].holes[k].torn)
+
+
+def taut(s: Any) -> float:
+  """Returns the largest tension of the needle's thread [N]."""
+  return float(s.thread.tension.max())
+
+
 def lens(s: Any) -> np.ndarray:
   """Returns where the lens of the laparoscope is that one holds [m]."""
   return s.lens()[0]

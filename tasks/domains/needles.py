@@ -102,7 +102,7 @@ class Needlework(Task):
         geom.contype, geom.conaffinity = geom.contype | MEETS, geom.conaffinity | MEETS
 
   def take_up(
-    self, physics: Any, pose: Pose, angle: float, lean: float, along: float
+    self, physics: Any, pose: Pose, angle: float, lean: float, along: float, side: float = 1.0
   ) -> np.ndarray:
     """Puts the needle into the right hand's jaws, as an episode begins.
 
@@ -112,6 +112,7 @@ class Needlework(Task):
       angle: where the jaws hold it, along its arc [rad]
       lean: most that it is turned about each axis of the world, drawn [rad]
       along: most that the jaws are off the angle, drawn [rad]
+      side: 1 where the jaws point against the circle's axis, -1 along it
 
     Returns:
       Where its tip is [m]  (3,).
@@ -121,7 +122,7 @@ class Needlework(Task):
     mat = about(0, turned[0]) @ about(1, turned[1]) @ about(2, turned[2]) @ mat
     angle = angle + self.random.uniform(-along, along)
     port = physics.trocar()
-    physics.set_joints(wrist.inverse(port, *grasp(port, place, mat, angle)))
+    physics.set_joints(wrist.inverse(port, *grasp(port, place, mat * (1, 1, side), angle)))
     self.joints = {"needle": np.concatenate([place, trocar.orientation(mat)])}
     self.joints |= {f"{self.prefix}jaw_{side}": np.array([_OPENING]) for side in ("left", "right")}
     self.right_holds, self.left_holds, self.loose, self.regrasps = 1.0, 0.0, 0.0, 0.0

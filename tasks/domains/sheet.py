@@ -60,8 +60,37 @@ def build(scene: Scene) -> mujoco.MjSpec:
   return spec
 
 
+def slit(
+  vertices: np.ndarray, triangles: np.ndarray, span: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Returns a sheet turned by a right angle, with a slit along y, near the middle of x.
+
+  Args:
+    vertices: of `sheet`, whose rows run along x [m]  (nvert, 3)
+    triangles: of it                                  (nelem, 3)
+    span: where along y the vertices are that it divides [m]
+
+  Returns:
+    vertices and triangles, and the two vertices of each place of the slit, by y  (n, 2).
+  """
+  vertices = vertices[:, [1, 0, 2]] * (-1.0, 1.0, 1.0)
+  row = vertices[np.abs(vertices[:, 0]).argmin(), 0]
+  low, high = vertices[:, 1] > span[0], vertices[:, 1] < span[1]
+  lips = np.flatnonzero((np.abs(vertices[:, 0] - row) < 1e-9) & low & high)
+  other = np.arange(len(vertices))
+  other[lips] = len(vertices) + np.arange(len(lips))
+  right = vertices[triangles, 0].mean(axis=1) > row
+  triangles = np.where(right[:, None], other[triangles], triangles)
+  return np.concatenate([vertices, vertices[lips]]), triangles, np.stack([lips, other[lips]], 1)
+
+
 def stretched(
-  scene: Scene, tissue: dict, mass: float, spare: float = 0.0, slots: int | None = None
+  scene: Scene,
+  tissue: dict,
+  mass: float,
+  spare: float = 0.0,
+  slots: int | None = None,
+  span: tuple[float, float] | None = None,
 ) -> mujoco.MjSpec:
   """Returns a sheet in its frame, with instruments, light and what is around.
 
@@ -71,8 +100,11 @@ def stretched(
     mass: of the sheet [kg]
     spare: room for a cut, times the square root of the nodes
     slots: of the window, see `scenes.furnish`
+    span: of a slit, see `slit`; None for none [m]
   """
   vertices, triangles = sheet(scene.nodes)
+  if span:
+    vertices, triangles, _ = slit(vertices, triangles, span)
   config = tissue | {"device": "cpu", "tolerance": scenes.TOLERANCE}
   flex = mjcf.flexcomp(
     scenes.ORGAN,

@@ -196,6 +196,36 @@ def bite_depth(bite: ArrayLike) -> float:
   return float(rows("bite", bite)[-1])
 
 
+@metric("Gap of the cut", "m", "outcome", "all", "FLS tasks 4 and 5: at most 1 mm")
+def final_gap(gap: ArrayLike) -> float:
+  """Returns how far the cut gapes at its widest in the end [m], lower is better.
+
+  Args:
+    gap: at its widest [m]  (nstep,)
+  """
+  return float(rows("gap", gap)[-1])
+
+
+@metric("Peak tension of the thread", "N", "safety", "all", "this project; as `peak_force`")
+def peak_tension(tension: ArrayLike) -> float:
+  """Returns the largest tension of the thread [N], lower is better.
+
+  Args:
+    tension: the largest along the thread [N]  (nstep,)
+  """
+  return float(rows("tension", tension).max())
+
+
+@metric("Tearing of holes", "m", "safety", "all", "FLS tasks 4 and 5: no avulsion")
+def tearing(torn: ArrayLike) -> float:
+  """Returns how far a hole of needle or thread has torn through tissue [m], lower is better.
+
+  Args:
+    torn: the farthest so far [m]  (nstep,)
+  """
+  return float(rows("torn", torn)[-1])
+
+
 @metric("Tracing error (Frechet)", "m", "outcome", "all", "Perk Tutor; Eiter and Mannila 1994")
 def trace_frechet(traced_pos: ArrayLike, curve: ArrayLike) -> float:
   """Returns the discrete Frechet distance of the tip's path to a curve [m], lower is better.

@@ -37,6 +37,7 @@ AFTER |= {
   "suture/drive_easy": "needle/transfer_easy",
   "suture/drive_standard": "suture/drive_easy",
   "suture/drive_hard": "suture/drive_standard",
+  "suture/running_easy": "suture/drive_easy",
   "probe/palpate_hard": "probe/palpate_standard",
 }
 RULE = f"{CONSECUTIVE} proficient attempts in a row and {REPEATS} more"

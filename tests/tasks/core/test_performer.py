@@ -15,9 +15,10 @@ OTHERS = ["/".join(pair) for pair in tasks.ALL_TASKS if pair not in tasks.EASY]
 # Least norms that an expert's observations never reach [N, -]; a hook divides without touching.
 BELOW = {"shaft_force": 0.05, "hook_shaft_force": 0.05, "burnt": 0.1}
 UNTOUCHED = {"hook_contact_force", "hook_peak_force"}
-# Searches, strokes, lines and rings of 15 s and more, which are slow, but for the easy ones.
+# Searches, strokes, lines, rings and seams of 15 s and more are slow; most easy ones are not here.
 LONG = {"probe/palpate_standard", "probe/palpate_hard"}
 LONG |= {"needle/transfer_standard", "needle/transfer_hard"}  # the first in tests/tasks
+LONG |= {"suture/running_easy"}
 LONG |= {
   f"{domain}/{task}" for domain in ("bimanual", "cut", "tease") for task in ("standard", "hard")
 }
@@ -27,7 +28,7 @@ LONG |= {
 CONSTANT = {
   "navigate": {"contact_force", "peak_force", "surface", "side"},
   "needle": {"left_psm_shaft_force", "way"},
-  "suture": {"holds", "way"},
+  "suture": {"holds", "way", "left_psm_shaft_force"},
 }
 
 
@@ -54,7 +55,7 @@ def wins(name, seeds):
   return count
 
 
-@pytest.mark.parametrize("name", EASY)
+@pytest.mark.parametrize("name", [name for name in EASY if name not in LONG])
 def test_expert_solves_the_easy_tasks(name):
   assert wins(name, range(1)) == 1
 

@@ -1,0 +1,587 @@
+"""Running: close a cut with a running suture of four stitches, with two wristed needle drivers.
+
+A stretched wall has a cut of 25 mm, which gapes by 2 mm. Four stitches are to close it, 6 mm apart
+and 4 mm from its edges, with one thread of polypropylene 3-0 that ends in a bead. Some of them are
+placed already, but loose. The right hand drives the needle through the two marks of a stitch,
+the left one takes its tip and draws needle and thread through. After the last one the thread is
+pulled until the gap is under a millimetre, and held so for half a second: no knot is tied.
+
+The thread meets the wall in its holes alone, and it floats: there is no gravity. The lips of the
+cut do not touch each other.
+
+Own observations, in the world: `target` (3,), from the needle's tip to the mark whose turn it is
+[m]; `way` (3,), from the mark of the way in to that of the way out [-]; `circle` (3,), axis of the
+needle's circle [-]; `middle` (3,), from the mark of the way in to the middle of that circle [m];
+`stitches` (1,), how many are placed; `pierced` (1,), holes of the next one that are made; `through`
+(1,), share of the needle that is through the last hole [-]; `gap` (1,), of the cut at its widest
+[m]; `tight` (1,), largest tension of the thread [N]; `right_holds` (1,), `left_holds` (1,), whether
+a hand holds the needle.
+
+Progress: 0.7 of it are the stitches to do, each 0.3 * closeness of the tip to the first mark; 0.4 +
+0.2 * closeness to the second one once it is in; 0.6 + 0.4 * through once it is through both. The
+last 0.3 go by the gap. Success: all stitches placed, and a gap under the limit for half a second.
+Failure: a hole farther from its mark than the tolerance, a stitch that is torn out, a needle that
+nobody holds for half a second, a force on the wall above the damage limit, or the time limit.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import mujoco
+import numpy as np
+import palpate
+import warp as wp
+from palpate.models import trocar, wrist
+from palpate.tissue.types import Array, floats, ints
+
+from ..core.base import Physics
+from ..core.performer import Performer, Script
+from ..core.rules import (
+  DAMAGED,
+  FAR,
+  HIDDEN,
+  LATER,
+  MISSED,
+  NOW,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  clamp,
+  closeness,
+  corner,
+  length,
+  needle_place,
+  pierced,
+  pinhole,
+  reach,
+  root,
+  taut,
+  torn_at,
+  vector,
+)
+from ..core.scenes import Scene
+from ..core.stage import STATE, Stage
+from ..registry import exercise
+from . import sheet
+from .drive import FRICTION, MARK, TOUGH, WALL, lowest
+from .needles import (
+  LOST,
+  MEETS,
+  QUARTER,
+  RADIUS,
+  WIDE,
+  Hands,
+  Needlework,
+  Pose,
+  arc,
+  arrive,
+  carry,
+  grasp,
+  grasped,
+  jaws,
+  left_grasp,
+  move_tip,
+  needle,
+  one,
+  right_grasp,
+)
+
+STITCHES, PITCH, BITE = 4, 0.006, 0.004  # [m]: between stitches, and from the edge of the cut
+TENSION = 40.0  # of the wall [N/m]
+CUT = (-0.0135, 0.0075)  # vertices of the wall that the cut divides, along y [m]
+CLOSED, HELD = 0.001, 0.5  # gap of a cut that is closed [m], and how long it is to stay so [s]
+THREAD, EDGE = 0.12, 0.0015  # length of the thread, and of its edges [m]
+# Radius of what is at its end, from there to the first hole, and its rise from the last one [m].
+_BEAD, _TAIL, _RISE = 0.001, 0.006, 0.003
+FIELD = Scene(
+  organ="sheet", instrument="psm", second="psm", port=(-0.06, 0.1, 0.08),
+  second_port=(0.06, 0.1, 0.08), camera=(0.0, 0.075, 0.085), nodes=480,
+)  # fmt: skip
+_MASS, _SLOTS = 0.004, 160  # of the wall [kg], and of its window
+# Where along the needle's arc, from its middle, the hands hold it [rad].
+_RIGHT, _LEFT = math.radians(-72.0), math.radians(70.0)
+# Of the expert: the angle of the tip that comes out at which it is taken, as high as the other hand
+# then is [rad], how high the needle is brought over the wall, how far a hand goes back and up [m],
+# and what it pulls with [N].
+_OUT, _HIGH, _BACK, _UP, _PULL = math.radians(92.5), 0.012, 0.01, 0.008, 0.7
+# How far it turns at once [rad], how high it is handed over [m], tension of a thread without slack
+# [N], and which way it is pulled.
+_LOOK, _OVER, _TAUT, _WAY = 0.6, 0.02, 0.3, np.array([0.6, 0.35, 0.72])
+
+
+@exercise("suture/running_easy", 40, "easy", "bimanual")
+def easy(**kwargs):
+  """Place the last of four stitches within 3 mm of its marks, and close the cut."""
+  return Running(FIELD, **{"placed": 3, "tolerance": 0.003, **kwargs})
+
+
+class State(Hands):
+  """State of a world."""
+
+  tolerance: float  # how far holes may be from their marks [m]
+  damage: float  # [N]
+  placed: int  # stitches that are placed at the start
+  close: float  # gap of a closed cut [m]
+  seat: Annotated[Any, ints("targets")]  # triangle of each mark
+  shares: Annotated[Any, Array(wp.vec3, ("targets",))]  # of its corners
+  marks: Annotated[Any, Array(wp.vec3, ("targets",))]  # where they are at rest [m]
+  lips: Annotated[Any, ints("pairs", 4)]  # triangle and corner of both lips at places of the cut
+  misses: Annotated[Any, floats("targets")]  # how far the holes are from their marks [m]
+  start0: float  # how far the tip was from the first mark at the start [m]
+  gap0: float  # of the cut then [m]
+  holes: int
+  done: int  # stitches that are placed
+  closed: float  # how long the gap has been under the limit [s]
+  pull: float  # of needle and thread on the wall [N]
+  pulled: float  # the largest so far [N]
+  deepest: float  # how far the needle was under the wall [m]
+  tightest: float  # largest tension so far [N]
+  torn: float  # how far a hole has torn at most [m]
+  target: Vector
+  way: Vector
+  circle: Vector
+  middle: Vector
+  stitches: float
+  pierced: float
+  through: float
+  gap: float
+  tight: float
+
+
+# The rules.
+
+
+def place(s, o, k):
+  """Returns where a mark is now [m]."""
+  a, b, c = corner(s, o.seat[k], 0), corner(s, o.seat[k], 1), corner(s, o.seat[k], 2)
+  return o.shares[k][0] * a + o.shares[k][1] * b + o.shares[k][2] * c
+
+
+def now(o):
+  """Returns the first mark of the stitch whose turn it is, of the last one when all are placed."""
+  return 2 * min(o.done, o.marks.shape[0] // 2 - 1)
+
+
+def widest(s, o):
+  """Returns how far the cut gapes at most [m]."""
+  most = float(-FAR)
+  for k in range(o.lips.shape[0]):
+    a, b = corner(s, o.lips[k, 0], o.lips[k, 1]), corner(s, o.lips[k, 2], o.lips[k, 3])
+    most = max(most, float(b[0] - a[0]))
+  return most
+
+
+def new_holes(s, o, count):
+  """Compares holes that are new with their marks; returns how far one is off at most [m]."""
+  for k in range(o.holes, count):
+    at, _ = pinhole(s, k)
+    off = at - o.marks[k]
+    o.misses[k] = root(off[0] * off[0] + off[1] * off[1])
+    reach(s, o, o.misses[k])
+  o.holes = count
+  worst = float(0.0)  # noqa: UP018 - a variable to Warp
+  for k in range(2 * o.placed, count):
+    worst = max(worst, o.misses[k])
+  return o, worst
+
+
+def advance(s, o):
+  """Follows needle and thread through the wall, and the gap."""
+  o = grasped(s, o, right_grasp(s), left_grasp(s))
+  count, pull = pierced(s)
+  o.pull = pull
+  o.tight = taut(s)
+  o.pulled = max(o.pulled, pull)
+  o.tightest = max(o.tightest, o.tight)
+  number = o.marks.shape[0]
+  for k in range(count):
+    o.torn = max(o.torn, torn_at(s, k))
+  o, worst = new_holes(s, o, min(count, number))
+  if o.holes > 2 * o.done:
+    o.deepest = max(o.deepest, -lowest(s))
+  o.through = 0.0
+  if o.holes == 2 * o.done + 2:
+    _, along = pinhole(s, o.holes - 1)
+    o.through = clamp(1.0 - along / (2.0 * QUARTER * RADIUS), 0.0, 1.0)
+    if along < 0.0:
+      o.done = o.done + 1
+      o.through = 0.0
+  o.gap = widest(s, o)
+  if o.pull > o.damage:
+    return o, -1.0, DAMAGED
+  todo = number // 2 - o.placed
+  part = float(o.done - o.placed)
+  if o.done < number // 2:
+    first = now(o)
+    far = length(arc(s, 1.0) - place(s, o, first + min(max(o.holes - first, 0), 1)))
+    if o.holes <= 2 * o.done:
+      part = part + 0.3 * closeness(far, o.start0)
+    elif o.holes == 2 * o.done + 1:
+      part = part + 0.4 + 0.2 * closeness(far, 2.0 * BITE)
+    else:
+      part = part + 0.6 + 0.4 * o.through
+  closing = clamp((o.gap0 - o.gap) / (o.gap0 - o.close), 0.0, 1.0)
+  progress = 0.7 * part / float(todo) + 0.3 * closing * float(o.done) / float(number // 2)
+  o.closed = o.closed + o.control_timestep if o.gap < o.close else 0.0
+  if count < 2 * o.done or worst > o.tolerance or o.loose > LOST:
+    return o, progress, MISSED
+  if o.done == number // 2 and o.closed > HELD - 1e-5:
+    return o, progress, SUCCESS
+  return o, progress, RUNNING
+
+
+def observe(s, o):
+  """Finds where the needle is from the stitch whose turn it is."""
+  middle = needle_place(s, vector(0.0, 0.0, 0.0))
+  first = now(o)
+  start, end = place(s, o, first), place(s, o, first + 1)
+  o.target = place(s, o, first + min(max(o.holes - first, 0), 1)) - arc(s, 1.0)
+  o.way = (end - start) / length(end - start)
+  o.circle = needle_place(s, vector(0.0, 0.0, 1.0)) - middle
+  o.middle = middle - start
+  o.stitches = float(o.done)
+  o.pierced = float(max(o.holes - 2 * o.done, 0))
+  return o
+
+
+def mark(s, o, k):
+  """Marks the holes that are left, the next one in yellow."""
+  look = LATER if k > o.holes else HIDDEN
+  return place(s, o, k) + vector(0.0, 0.0, MARK), NOW if k == o.holes else look
+
+
+class Running(Needlework):
+  """Close a cut with a running suture."""
+
+  rules = Rules(
+    State,
+    advance,
+    observe,
+    ("target", "way", "circle", "middle", "stitches", "pierced", "through", "gap", "tight",
+     "right_holds", "left_holds"),
+    metrics={"peak_traction": "pulled", "bite_depth": "deepest", "regrasps": "regrasps",
+             "final_gap": "gap", "peak_tension": "tightest", "tearing": "torn"},
+    mark=mark,
+  )  # fmt: skip
+  targets = 2 * STITCHES
+
+  def __init__(
+    self,
+    scene: Scene,
+    random=None,
+    *,
+    placed: int,
+    tolerance: float,
+    close: float = CLOSED,
+    tension: float = TENSION,
+    tough: float = TOUGH,
+    **kwargs,
+  ):
+    """Makes the task.
+
+    Args:
+      scene: what it plays in
+      random: see Task
+      placed: stitches that are placed at the start, of four
+      tolerance: how far holes may be from their marks [m]
+      close: gap that is closed [m]
+      tension: of the wall [N/m]
+      tough: energy that it takes to open an area of the wall [J/m^2]
+      **kwargs: see Task
+    """
+    self.placed, self.tolerance, self.close = placed, tolerance, close
+    self.tension, self.tough = tension, tough
+    self.edges = sheet.slit(*sheet.sheet(kwargs.get("nodes") or scene.nodes), CUT)[2]
+    self.pairs = len(self.edges)
+    kwargs = {"force_limit": 3.0, "damage": 8.0, **kwargs}
+    super().__init__(dataclasses.replace(scene, targets=self.targets), random, **kwargs)
+
+  def spec(self, variant: int | None) -> mujoco.MjSpec:
+    """Returns the scene: a wall with a cut in a frame, and the needle with its thread."""
+    law = {"needles": f"needle {self.tough:g} {FRICTION:g}", "tension": self.tension}
+    spec = sheet.stretched(self._scene(variant), WALL | law, _MASS, slots=_SLOTS, span=CUT)
+    spec.option.gravity = np.zeros(3)
+    self.meet(spec)
+    apart = np.array([0.1, 0.0, -0.05])  # until an episode begins
+    nodes = (
+      apart + (0.0, 0.0, -RADIUS) + np.arange(round(THREAD / EDGE) + 1)[:, None] * (0, 0, -EDGE)
+    )
+    meets = {"contype": 0, "conaffinity": 0}
+    palpate.add_thread(spec, nodes, "suture", material="polypropylene", bead=_BEAD, contact=meets)
+    meets = {"contype": 1 | MEETS, "conaffinity": 1 | MEETS}
+    palpate.add_needle(spec, pos=tuple(apart), quat=(1, 1, 0, 0), thread="suture", contact=meets)
+    return spec
+
+  def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Returns all of the wall, and its middle."""
+    return np.arange(len(physics.organ.elem)), np.zeros(3)
+
+  def _stage(self, spec: mujoco.MjSpec) -> Stage:
+    """Returns the stage: the cut gapes, and the stitches that are placed are sewn."""
+    made = super()._stage(spec)
+    data = mujoco.MjData(made.model)
+    mujoco.mj_setState(made.model, data, made.state, STATE)
+    mujoco.mj_forward(made.model, data)
+    organ = palpate.Organ(made.model, data, self.organ)
+    seat, share = _seats(organ.xpos0, organ.elem, self._planned(organ.xpos0))
+    at = (share[..., None] * organ.xpos[organ.elem[seat]]).sum(axis=1)
+    self.held = posed(at[2 * self.placed :], -math.radians(60.0))
+    self.held = self.held[0] + np.array([-0.003, 0.0, _HIGH]), self.held[1]
+    pos, mat = self.held
+    data.joint("needle").qpos[:] = np.concatenate([pos, trocar.orientation(mat)])
+    mujoco.mj_forward(made.model, data)
+    line = _laid(at[: 2 * self.placed], pos - RADIUS * mat[:, 1])
+    palpate.Thread(made.model, data, "suture").lay(line)
+    organ.sew("needle")
+    data.qvel[:] = 0
+    mujoco.mj_getState(made.model, data, made.state, STATE)
+    return made
+
+  def _planned(self, rest: np.ndarray) -> np.ndarray:
+    """Returns the marks at rest before they are drawn [m]  (2 * STITCHES, 3)."""
+    x, y, _ = rest[self.edges[:, 0]].mean(axis=0)
+    rows = y + PITCH * (np.arange(STITCHES) - (STITCHES - 1) / 2)
+    return np.array([[x + side * BITE, row, 0.0] for row in rows for side in (-1, 1)])
+
+  def begin(self, physics: Physics) -> None:
+    """Draws the marks and how the right hand holds the needle."""
+    rest, elem = physics.organ.xpos0, physics.organ.elem
+    self.marks, first = self._planned(rest), 2 * self.placed
+    todo = self.random.uniform(-0.001, 0.001, (STITCHES - self.placed, 1, 2))
+    each = self.random.uniform(-0.0005, 0.0005, (STITCHES - self.placed, 2, 2))
+    self.marks[first:, :2] += (todo + each).reshape(-1, 2)
+    self.seat, self.shares = _seats(rest, elem, self.marks)
+    self.lips = np.array([_corner(elem, v) for v in self.edges.ravel()]).reshape(-1, 4)
+    self.holes, self.done, self.misses = first, self.placed, np.zeros(self.targets)
+    self.pull = self.pulled = self.deepest = self.tight = self.tightest = self.torn = 0.0
+    self.closed = self.through = self.stitches = self.pierced = 0.0
+    self.target, self.way, self.circle, self.middle = np.zeros((4, 3))
+    self.gap = self.gap0 = widest(physics, self)
+    tip = self.take_up(physics, self.held, _RIGHT, lean=0.0, along=0.08, side=-1.0)
+    self.start0 = float(np.linalg.norm(tip - place(physics, self, first)))
+    _, second = physics.hands
+    port, aside = second.trocar(), self.random.uniform(-0.005, 0.005, 3)
+    pos, turn = park(port)
+    second.set_joints(wrist.inverse(port, pos + aside, turn))
+
+  def mark_size(self, k: int) -> float:
+    """Returns the radius of a mark [m]."""
+    return MARK
+
+  def label(self, kind: str) -> str:
+    """Returns what an event of the rules is called."""
+    if kind == "damage":
+      return f"torn by a pull of {self.pull:.2f} N"
+    return "hole" if kind == "target" else super().label(kind)
+
+  def recorded(self, physics: Physics) -> dict[str, float]:
+    """Returns pull, bite, gap, tension and tears."""
+    return {
+      "traction": self.pull, "bite": self.deepest, "regrasped": self.regrasps, "gap": self.gap,
+      "tension": self.tight, "torn": self.torn,
+    }  # fmt: skip
+
+  def instruct(self, physics: Physics) -> str:
+    """Says what is next."""
+    if self.done == STITCHES:
+      return "Pull the thread until the cut is closed, and hold it"
+    which = f"stitch {self.done + 1} of {STITCHES}"
+    return (
+      f"Bring the needle's tip to the yellow mark of {which}, and turn it in",
+      "Turn the needle about its circle, to the yellow mark",
+      "Take the needle's tip with the left hand, and draw it through",
+    )[min(max(self.holes - 2 * self.done, 0), 2)]
+
+  def expert(self, p: Performer) -> Script:
+    """Drives each stitch with the right hand, draws it through with the left one, and pulls."""
+    assert p.other
+    while self.outcome is None:
+      out = self.holes == 2 * self.done + 2
+      if self.done == STITCHES:
+        yield from one(p, p.other, self._pull(p.other, lambda: self.outcome is not None))
+      elif self.right_holds and out and self.left_holds:
+        yield from one(p, p, _let_go(p))
+      elif self.left_holds and out:
+        yield from one(p, p.other, self._draw(p.other))
+      elif self.left_holds and self.right_holds:
+        yield from one(p, p.other, _let_go(p.other))
+      elif self.left_holds:
+        yield from one(p, p.other, self._hand(p.other))
+        yield from one(p, p, self._take(p, _RIGHT))
+      elif self.right_holds and out and self._angle(p) > _OUT - 0.1:
+        yield from one(p, p.other, self._take(p.other, _LEFT))
+      elif self.right_holds:
+        yield from one(p, p, self._drive(p))
+      else:
+        yield from p.wait(0.1)
+
+  def _ends(self, p: Performer, first: int | None = None) -> np.ndarray:
+    """Returns where the marks of a stitch are, of that whose turn it is [m]  (2, 3)."""
+    first = now(self) if first is None else first
+    return np.array([place(p.physics, self, first + k) for k in range(2)])
+
+  def _angle(self, p: Performer) -> float:
+    """Returns the angle of the needle's tip, see `posed`, from -90 to 270 degrees."""
+    ends, tip = self._ends(p), arc(p.physics, 1.0) - needle(p.physics)[0]
+    way = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    angle = math.atan2(float(tip @ way), -float(tip[2]))
+    return angle if angle > -math.pi / 2 else angle + 2 * math.pi
+
+  def _turn(self, p: Performer, end: float) -> Script:
+    """Turns the needle on about its circle; looks how the needle lies in the jaws meanwhile."""
+    start, first = self._angle(p), now(self)  # which may be another when the thread follows
+    stop = min(start + _LOOK, end)
+
+    def way(t: float) -> Pose:
+      return posed(self._ends(p, first), start + t * (stop - start))
+
+    yield from carry(p, way, stop - start)
+    yield from arrive(p)
+
+  def _drive(self, p: Performer) -> Script:
+    """Puts the needle over the first mark, and turns it about its circle through both."""
+    if self.holes <= 2 * self.done:
+      ends = self._ends(p)
+      pos, mat = posed(ends, -half(ends) - math.radians(14.0))
+      yield from carry(p, lambda t: (pos + np.array([0.0, 0.0, 0.006]), mat))
+      yield from arrive(p)
+      yield from carry(p, lambda t: (pos, mat))
+      yield from arrive(p)
+    while self._angle(p) < _OUT - 0.02:
+      yield from self._turn(p, _OUT)
+
+  def _take(self, p: Performer, angle: float) -> Script:
+    """Takes the needle from behind, at an angle along its arc."""
+    p.extra[:] = WIDE
+    pos, mat = needle(p.physics)
+    goal, turn = grasp(p.trocar, pos, mat * (1, 1, -1), angle, p.turn)
+    yield from move_tip(p, goal + _away(turn), turn)
+    yield from arrive(p)
+    yield from move_tip(p, goal, turn)
+    yield from arrive(p)
+    yield from jaws(p, -1.0)
+    yield from p.wait(0.2)
+
+  def _draw(self, p: Performer) -> Script:
+    """Turns the needle out of the wall, and draws the thread after it."""
+    done, end = self.done, half(self._ends(p)) + math.radians(185.0)
+    while self.done == done and self._angle(p) < end - 0.05:
+      yield from self._turn(p, end)
+    while self.done == done:
+      yield from p.line(p.tip + np.array([0.001, 0.0, 0.002]), 0.02)
+    yield from self._pull(p, lambda: self.tight > _TAUT)
+
+  def _hand(self, p: Performer) -> Script:
+    """Brings the needle over the next stitch, to where the right hand can take it."""
+    pos, mat = posed(self._ends(p), math.radians(90.0))
+    pos = pos + np.array([0.0, 0.0, _OVER])
+    yield from carry(p, lambda t: (pos + np.array([0.0, 0.0, 0.01]), mat))
+    yield from carry(p, lambda t: (pos, mat))
+    yield from arrive(p)
+
+  def _pull(self, p: Performer, enough: Callable[[], bool]) -> Script:
+    """Pulls at the thread until that is enough."""
+    most = _PULL * self.tension / TENSION * p.style.force
+    while not enough():
+      speed = float(np.clip(0.05 * (most - self.tight), -0.01, 0.025))
+      p.tip = p.tip + p.care * speed * p.dt * _WAY
+      yield p.step()
+
+
+def _seats(rest: np.ndarray, elem: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the triangle of each of some places of a flat wall (n,), and shares in it (n, 3)."""
+  a, b, c = (rest[elem[:, k], :2] for k in range(3))
+  sides = np.stack([b - a, c - a], axis=2)
+  share = np.linalg.solve(sides, (at[:, None, :2] - a)[..., None])[..., 0]
+  share = np.concatenate([1 - share.sum(axis=2, keepdims=True), share], axis=2)
+  seat = share.min(axis=2).argmax(axis=1)
+  return seat, share[np.arange(len(at)), seat]
+
+
+def _corner(elem: np.ndarray, vertex: int) -> tuple[int, int]:
+  """Returns a triangle and the corner of it that a vertex is."""
+  triangle, which = np.argwhere(elem == vertex)[0]
+  return int(triangle), int(which)
+
+
+def _laid(holes: np.ndarray, swage: np.ndarray) -> np.ndarray:
+  """Returns the line of a thread through holes of stitches, from the swage on [m].
+
+  What is over of it is in a bow over the stitches.
+  """
+  deep, share = 0.0015, np.linspace(0.0, 1.0, 100)
+  line = [holes[0] + (1 - share[:-1, None]) * (0.0, 0.0, _TAIL)]
+  for k, (start, end) in enumerate(itertools.pairwise(holes)):
+    down = (1 if k % 2 else -1) * deep * np.sin(np.pi * share)
+    line.append(start + share[:-1, None] * (end - start) + down[:-1, None] * (0.0, 0.0, 1.0))
+  top = holes[-1] + share[:, None] * (0.0, 0.0, _RISE)
+  seam = np.concatenate([*line, top])
+  over, angle, bow = THREAD - _along(seam), 0.0, seam
+  low, high = 0.1, math.pi - 0.1
+  for _ in range(30):
+    angle = 0.5 * (low + high)
+    bow = _bow(swage, seam[-1], angle)
+    low, high = (angle, high) if _along(bow) < over else (low, angle)
+  return np.concatenate([bow, seam[-2::-1]])
+
+
+def _along(line: np.ndarray) -> float:
+  """Returns the length of a line [m]."""
+  return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+
+
+def _bow(start: np.ndarray, end: np.ndarray, angle: float) -> np.ndarray:
+  """Returns an arc of twice an angle [rad] between two points, over the wall [m]."""
+  chord = start - end
+  along, aside = chord / np.linalg.norm(chord), np.array([0.1, -0.8, 0.6])
+  aside -= (aside @ along) * along
+  aside /= np.linalg.norm(aside)
+  radius = 0.5 * np.linalg.norm(chord) / math.sin(angle)
+  turn = np.linspace(angle, -angle, 400)[:, None]
+  middle = 0.5 * (start + end) - radius * math.cos(angle) * aside
+  bow = middle + radius * (np.sin(turn) * along + np.cos(turn) * aside)
+  return np.column_stack([bow[:, :2], np.maximum(bow[:, 2], 0.9 * _RISE)])
+
+
+def half(ends: np.ndarray) -> float:
+  """Returns half of the angle between two marks on the needle's circle [rad]."""
+  return math.asin(min(0.5 * float(np.linalg.norm(ends[1] - ends[0])) / RADIUS, 0.9))
+
+
+def posed(ends: np.ndarray, tip: float) -> Pose:
+  """Returns the needle's pose with its circle through two marks, by the angle of its tip.
+
+  The angle is that at the middle of the circle, from straight down towards the second mark [rad].
+  """
+  way, up = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0]), np.array([0.0, 0.0, 1.0])
+  axis = np.cross(way, up)
+  middle = 0.5 * (ends[0] + ends[1]) + RADIUS * math.cos(half(ends)) * up
+  angle = tip - math.pi / 2
+  x = -math.cos(angle) * up + math.sin(angle) * way
+  return middle, np.column_stack([x, np.cross(axis, x), axis])
+
+
+def park(port: Any) -> Pose:
+  """Returns a pose of a tip beside the wall, jaws away from the port."""
+  side = math.copysign(1.0, port.pos[0])
+  back, across = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])
+  return np.array([side * 0.03, 0.03, 0.02]), np.column_stack(
+    [across, np.cross(back, across), back]
+  )
+
+
+def _let_go(p: Performer) -> Script:
+  """Opens the jaws and takes the hand back and aside."""
+  yield from jaws(p, WIDE)
+  yield from move_tip(p, p.tip + _away(p.turn), p.turn)
+  pos, _ = park(p.trocar)
+  yield from move_tip(p, pos, p.turn)
+
+
+def _away(turn: np.ndarray) -> np.ndarray:
+  """Returns the way of open jaws off the needle: back, and up from the wall [m]."""
+  return _BACK * turn[:, 2] + np.array([0.0, 0.0, _UP])
