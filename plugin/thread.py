@@ -132,20 +132,25 @@ class Thread:
     out[organ.free] += self.data.qpos[at] - self.model.qpos0[at]
     return out
 
-  def lay(self, points: np.ndarray):
-    """Puts it at rest along a line, its edges as long as at rest.
+  def lay(self, points: np.ndarray, nodes: Sequence[int] | None = None):
+    """Puts it, or a part of it, at rest along a line, its edges as long as at rest.
 
     Args:
-      points: of the line, from its first node on, in the world [m]; beyond it the thread goes on
-        straight                                                       (n, 3)
+      points: of the line, from the first of the nodes on, in the world [m]; beyond it the thread
+        goes on straight                                               (n, 3)
+      nodes: that lie along it, from one of them to an end of the thread; what they leave stays
+        where it is. None for all, whose twist and breaks are forgotten then
 
     Raises:
-      ValueError: it has pinned nodes.
+      ValueError: it has pinned nodes, or the nodes are not one after the other.
     """
     organ, line = self._space.organ, np.asarray(points, dtype=float)
     if not organ.free.all():
       raise ValueError(f"thread {self.name!r} has pinned nodes, expected one that is free")
-    length = np.linalg.norm(np.diff(organ.rest, axis=0), axis=1)
+    which = np.arange(len(organ.rest)) if nodes is None else np.asarray(nodes)
+    if abs(np.diff(which)).max(initial=1) != 1 or abs(which[-1] - which[0]) != len(which) - 1:
+      raise ValueError(f"thread {self.name!r}: nodes is {nodes}, expected one after the other")
+    length = np.linalg.norm(np.diff(organ.rest[which], axis=0), axis=1)
     last = line[-1] - line[-2]
     line = np.concatenate([line, line[-1:] + length.sum() / np.linalg.norm(last) * last])
     places, k = [line[0]], 0
@@ -155,10 +160,12 @@ class Thread:
       way, off = line[k + 1] - line[k], line[k] - places[-1]
       a, b, c = way @ way, way @ off, off @ off - far**2
       places.append(line[k] + (np.sqrt(b * b - a * c) - b) / a * way)
-    self._space.plugin_state[:] = 0.0
-    at = organ.qposs.reshape(-1, 3)
-    self.data.qpos[at] = self.model.qpos0[at] + (places - organ.origin) @ organ.frame - organ.rest
-    self.data.qvel[organ.dofs] = 0.0
+    if nodes is None:
+      self._space.plugin_state[:] = 0.0
+    at = organ.qposs.reshape(-1, 3)[which]
+    local = (places - organ.origin) @ organ.frame - organ.rest[which]
+    self.data.qpos[at] = self.model.qpos0[at] + local
+    self.data.qvel[organ.dofs.reshape(-1, 3)[which]] = 0.0
 
   @property
   def length(self) -> float:

@@ -43,6 +43,7 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "gap": (),
   "tension": (),
   "torn": (),
+  "security": (),
 }
 # Those that are measured faster: with substeps, magnitudes, one for each since the last sample.
 SIGNALS = ("force", "grip_force", "shaft_force", "surroundings_force")

@@ -221,7 +221,7 @@ class Recorder:
         `regrasped`, how often the needle was taken so far, `ring_time`, how long rings were touched
         [s], and `ring_force`, with how much at most [N]; `bite`, how deep a needle went under a
         wall [m]; `gap`, of a cut at its widest [m], `tension`, largest of a thread [N], `torn`, how
-        far a hole of it has torn [m]
+        far a hole of it has torn [m]; `security`, the pull that its knot has held [N]
     """
     time = float(time)
     if not (math.isfinite(time) and time > self._last):

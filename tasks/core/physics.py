@@ -273,8 +273,8 @@ class Physics(Instrument, Portable):
       return 0.0
     contact = data.contact
     pairs = contact.flex.max(axis=1).tolist(), contact.elem.max(axis=1).tolist()
-    touched = set(zip(*pairs, strict=True))
-    touched.discard((-1, -1))  # of two geoms
+    flat = np.append(model.flex_dim == 2, False)  # not a thread, nor two geoms, which have -1
+    touched = {pair for pair in zip(*pairs, strict=True) if flat[pair[0]]}
     if not touched:
       return 0.0
     flex, elem = np.array(sorted(touched)).T

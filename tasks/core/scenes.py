@@ -42,8 +42,10 @@ CONTACT = {
 TOLERANCE = 1e-2
 # Slots of the organ's window for each 1000 nodes; the experts' instruments touch 15 and 38 at most.
 _SLOTS = {"probe": 40, "grasper": 48, "scalpel": 40, "hook": 24, "laparoscope": 40, "psm": 40}
+_SLOTS |= {"knot_pusher": 24}
 # More than MuJoCo's 1 makes friction creep less: 2.4 N of grip then hold 3 N, with 3 only 2 N.
 _IMPRATIO = {"probe": 3, "grasper": 10, "scalpel": 3, "laparoscope": 3, "psm": 100}
+_IMPRATIO |= {"knot_pusher": 10}
 # Foundation of an organ that comes away from its bed [Pa/m]; ours: what lies around it lets go too.
 _LOOSE = 3e3
 _FILM = (0.0045, 0.0045, 0.0012)  # of the film where a bond is, and of the raw bed [m]

@@ -33,6 +33,7 @@ _SKIN, _MARGIN = 2.5e-4, 6e-4  # radius of the flex; of the thread's contacts, w
 _RGBA, _BLOCK = (0.86, 0.72, 0.42, 1.0), (0.022, 0.02, 0.003)
 HANDS, BLOCK = 8, 16  # bits of what meets instruments: the thread, and the block under the drain
 _SAMPLES = 4001  # of a section
+_NEAR = 0.002  # from a mark to the vertices that a test pulls at [m]
 SETTLES = 0.1  # see `Task`: the thread falls meanwhile, until it is laid [s]
 
 
@@ -69,7 +70,9 @@ def drain(nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   return np.array(vertices), np.concatenate([first, second]), np.array(lips)
 
 
-def build(scene: Scene, line: np.ndarray, meets: int = HANDS, **thread) -> mujoco.MjSpec:
+def build(
+  scene: Scene, line: np.ndarray, meets: int = HANDS, friction: float = FRICTION, **thread
+) -> mujoco.MjSpec:
   """Returns the drain on its block with a thread, instruments, light and what is around.
 
   The needle has been cut off the thread. The organ still knows the thread by it: see `sew`.
@@ -78,12 +81,13 @@ def build(scene: Scene, line: np.ndarray, meets: int = HANDS, **thread) -> mujoc
     scene: what it plays in; its organ has about so many nodes
     line: the thread's nodes, from where the needle was to the other end [m]  (n, 3)
     meets: bits of what the thread meets: `HANDS` the instruments, 1 the drain
+    friction: of the thread in the drain [N/m]
     **thread: see `palpate.add_thread`
   """
   vertices, triangles, _ = drain(scene.nodes)
   foot = np.flatnonzero(vertices[:, 2] < 0.1 * HIGH)
   law = f"{BED} {mjcf.numbers(HELD)} at {' '.join(map(str, foot))}"
-  tissue = LATEX | {"needles": f"needle {TOUGH:g} {FRICTION:g}", "bonds": law}
+  tissue = LATEX | {"needles": f"needle {TOUGH:g} {friction:g}", "bonds": law}
   flex = mjcf.flexcomp(
     ORGAN,
     (vertices, triangles),
@@ -132,3 +136,21 @@ def gap(places: np.ndarray, nodes: int) -> float:
   rest, _, lips = drain(nodes)
   right, left = lips[np.abs(rest[lips[:, 0], 1]) < 0.25 * SLIT].T
   return float((places[right, 0] - places[left, 0]).max(initial=0.0))
+
+
+def part(organ: palpate.Organ, nodes: int, force: float) -> None:
+  """Pulls both sides of the slit apart at the marks, as a test of the knot, each with a force [N].
+
+  Args:
+    organ: the drain
+    nodes: that it was made with, see `drain`
+    force: on each side until it is called again [N]
+  """
+  rest, _, _ = drain(nodes)
+  model, data = organ.model, organ.data
+  flex = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, ORGAN)
+  body = model.flex_vertbodyid[model.flex_vertadr[flex] :][: len(rest)]
+  for side in (-1.0, 1.0):
+    mark = MIDDLE + np.array([0.5 * side * BITE, 0.0, 0.0])
+    near = body[np.linalg.norm(rest - mark, axis=1) < _NEAR]
+    data.xfrc_applied[near, 0] = side * force / len(near)

@@ -226,6 +226,19 @@ def tearing(torn: ArrayLike) -> float:
   return float(rows("torn", torn)[-1])
 
 
+@metric("Knot security", "N", "outcome", "all", "FLS tasks 4 and 5: security", better="neither")
+def knot_security(security: ArrayLike) -> float:
+  """Returns the pull on a slit that its knot has held closed [N], neither is better.
+
+  Args:
+    security: so far; NaN before the test [N]  (nstep,)
+  """
+  held = float(rows("security", security)[-1])
+  if math.isnan(held):
+    raise UnknownError("the knot was not tested")
+  return held
+
+
 @metric("Tracing error (Frechet)", "m", "outcome", "all", "Perk Tutor; Eiter and Mannila 1994")
 def trace_frechet(traced_pos: ArrayLike, curve: ArrayLike) -> float:
   """Returns the discrete Frechet distance of the tip's path to a curve [m], lower is better.

@@ -38,6 +38,7 @@ AFTER |= {
   "suture/drive_standard": "suture/drive_easy",
   "suture/drive_hard": "suture/drive_standard",
   "suture/running_easy": "suture/drive_easy",
+  "suture/extracorporeal_easy": "touch/easy",
   "probe/palpate_hard": "probe/palpate_standard",
 }
 RULE = f"{CONSECUTIVE} proficient attempts in a row and {REPEATS} more"

@@ -165,7 +165,7 @@ def test_the_page_has_every_observation():
         bare = key.removeprefix("hook_").removeprefix("left_psm_")
         row = observation.ROWS.get(bare)
         if row:
-          wristed = domain in ("needle", "suture") and bare in ("joints", "joint_vel", "drive")
+          wristed = env.physics.trocar().wrist and bare in ("joints", "joint_vel", "drive")
           assert spec.shape == ((6,) if wristed else row.shape) and spec.dtype == np.float64
         else:
           cells = f" | `{key}` | `state` | {shape} | float64 |"

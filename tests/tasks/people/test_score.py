@@ -42,7 +42,7 @@ def test_table_is_consistent():
     "log_dimensionless_jerk",
   }
   shown = {"mean_speed", "economy_of_volume", "sparc", "bimanual_dexterity", "share_freed"}
-  shown |= {"bite_depth"}
+  shown |= {"bite_depth", "knot_security"}
   assert set(METRICS) - set(SCORED) == shown
 
 

@@ -32,7 +32,7 @@ const GERMAN = {
   // Domains, and the words that levels are made of.
   "touch/": "Berühren", "probe/": "Drücken und Tasten", "trace/": "Nachfahren", "grasp/": "Greifen", "retract/": "Weghalten", "tease/": "Ablösen",
   "dissect/": "Abpräparieren", "cut/": "Schneiden", "bimanual/": "Mit zwei Händen", "navigate/": "Kamera führen", "needle/": "Nadel übergeben", "suture/": "Nähen",
-  "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate": "tasten", "drive": "durchstechen", "running": "fortlaufend", "transfer": "übergeben",
+  "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate": "tasten", "drive": "durchstechen", "running": "fortlaufend", "transfer": "übergeben", "extracorporeal": "Knoten hinunterschieben",
   // What exercises ask for.
   "touch one point within # mm": "berühre einen Punkt auf # mm genau", "touch four points within # mm": "berühre vier Punkte auf # mm genau",
   "touch six points within # mm, on livers that vary": "berühre sechs Punkte auf # mm genau, auf wechselnden Lebern",
@@ -71,6 +71,7 @@ const GERMAN = {
   "place the last of four stitches within # mm of its marks, and close the cut": "setze den letzten von vier Stichen auf # mm genau an seine Marken, und schließe den Schnitt",
   "drive it within # mm, in changing directions": "stich sie auf # mm genau, in wechselnden Richtungen",
   "drive it within # mm, as FLS asks for, through a tougher wall": "stich sie auf # mm genau, wie FLS es verlangt, durch eine zähere Wand",
+  "push one throw down, and close the slit to # mm": "schiebe einen Wurf hinunter und schließe den Schlitz auf # mm",
   // What runs.
   "Loading {0}": "Lädt {0}", "Loading {0}, which takes a minute or more": "Lädt {0}, das dauert eine Minute oder mehr",
   "Choose an exercise and press Start.": "Wähle eine Übung und drücke Start.",
@@ -137,6 +138,9 @@ const GERMAN = {
   "Take the needle's tip with the left hand, and draw it through": "Nimm die Nadelspitze mit der linken Hand und ziehe sie durch",
   "Pull the thread until the cut is closed, and hold it": "Ziehe am Faden, bis der Schnitt zu ist, und halte ihn",
   "Turn the needle about its circle, to the yellow mark": "Drehe die Nadel um ihren Kreis, zur gelben Marke", "Turn it on until the tip is out": "Drehe weiter, bis die Spitze heraus ist",
+  "Push throw # of # down until the slit is closed": "Schiebe Wurf # von # hinunter, bis der Schlitz zu ist",
+  "Take the pusher back up to the yellow mark": "Nimm den Schieber zurück bis zur gelben Marke",
+  "Knot security": "Halt des Knotens",
   "Depth of the bite": "Tiefe des Stichs", "Gap of the cut": "Spalt des Schnitts", "Peak tension of the thread": "Größte Fadenspannung",
   "Tearing of holes": "Ausreißen der Stichkanäle", "Grasps of the needle": "Griffe an die Nadel", "Contact with rings": "Kontakt mit Ringen", "Peak force on rings": "Größte Kraft auf Ringe",
   "plan how the other hand is to take it before you hand it over": "plane vor dem Übergeben, wie die andere Hand sie nimmt", "turn the needle about its circle in place of pushing it": "drehe die Nadel um ihren Kreis, statt sie zu schieben",

@@ -1,0 +1,342 @@
+"""Extracorporeal: push a throw that was tied outside the body down on a slit, with a knot pusher.
+
+FLS task 4. The thread goes through the marks of a slit Penrose drain, see `drain`, and both strands
+come up to the hands outside. These are not simulated: each strand's end is on a slide along it and
+is drawn with a fixed pull. A throw is laid loosely around both strands, high over the drain. One of
+them, the post, goes through the ring of the pusher, which takes the throw down by contact alone. A
+throw is seated when it is down and the slit is closed to 1 mm, for 0.3 s. With the pusher back at
+the mark, the hands outside tie the next throw, the other way round.
+
+Own observations, in the world: `target` (3,), from the tip to where the throw is to be, or to the
+mark that the pusher is to go back to [m]; `throw` (3,), from the tip to the throw [m]; `gap` (1,),
+of the slit [m]; `tension` (1,), the largest of the thread [N]; `seated` (1,), throws that are.
+
+Progress: (seated + 0.9 * closeness of the throw to its seat, 0 at the least) / throws. Success: all
+throws are seated; after more than one the strands are let go and the slit is pulled apart, and the
+knot is to be right, see `palpate.tasks.metrics.knots`, and to hold the slit closed. Failure: a
+knot that does not, a thread that breaks or tears out of the drain, a force above the damage limit,
+or the time limit.
+
+It has no vectorised form: a batch cannot lay a thread and sew it while it runs.
+"""
+
+import math
+
+import mujoco
+import numpy as np
+import palpate
+from palpate.models import trocar
+
+from ..core.base import Physics, Task
+from ..core.performer import Performer, Script
+from ..core.rules import closeness
+from ..core.scenes import CONTACT, Scene
+from ..metrics import knots
+from ..registry import exercise
+from . import drain
+from .drain import MIDDLE
+
+FIELD = Scene(
+  instrument="knot_pusher", port=(0.0, 0.045, 0.11), camera=(0.042, -0.03, 0.045), nodes=400,
+)  # fmt: skip
+CLOSED = 0.001  # gap of a slit that is [m], as FLS asks for
+EDGE = 4.5e-4  # of the thread, four of its radii [m]
+PULL = 0.6  # of each hand outside [N]
+HIGH = 0.010  # of a throw that is laid over what it is to be pushed to [m]
+_HANDS = np.array([0.0, -0.006, 0.026])  # from the stitch to between the hands outside [m]
+_APART = 0.004  # of these [m]
+_MASS, _DAMPING = 0.02, 5.0  # of each, on its slide [kg], [N s/m]
+# Of a throw that is laid: from the strands to its middle, and its length [m].
+_LOOSE, _LONG = 2.5e-4, 0.0024
+# Friction of the ring on any thread: with silk's it would drag both strands along.
+_POLISHED = 0.1
+_TURNS = 121  # points that it is laid with
+_PAST = 6e-4  # from strands that cross over it to between them [m]
+_TOUCH = 3.0  # radii between the middles of strands that touch
+_SEAT = 0.003  # a throw no higher over the holes is down [m]
+_STAYS = 0.3  # and is to stay there for so long [s]
+_TEST, _RISES, _TESTED = 0.1, 0.3, 0.5  # pull of the test [N]; it has risen, and ends [s]
+_MARK = 0.018  # height of the mark over the drain [m]
+
+
+@exercise("suture/extracorporeal_easy", 15, "easy")
+def easy(**kwargs):
+  """Push one throw down, and close the slit to 1 mm."""
+  return Extracorporeal(FIELD, **{"throws": 1, **kwargs})
+
+
+class Extracorporeal(Task):
+  """Push throws down with a knot pusher."""
+
+  settles = drain.SETTLES
+
+  def __init__(self, scene: Scene, random=None, *, throws: int, **kwargs):
+    """Makes the task.
+
+    Args:
+      scene: what it plays in
+      random: see Task
+      throws: how many
+      **kwargs: see Task
+    """
+    self.throws = throws
+    kwargs = {"force_limit": 3.0, "damage": 6.0, **kwargs}
+    super().__init__(scene, random, **kwargs)
+
+  def spec(self, variant: int | None) -> mujoco.MjSpec:
+    """Returns the scene: the drain, its thread, and a slide for each of its ends."""
+    line = _line(*strands(HIGH, 1))
+    count = int(np.linalg.norm(np.diff(line, axis=0), axis=1).sum() / EDGE) + 1
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
+    nodes = np.stack([np.interp(EDGE * np.arange(count), along, c) for c in line.T], axis=1)
+    spec = drain.build(self._scene(variant), nodes)
+    for name, node, way in _ends(count):
+      hand = spec.worldbody.add_body(name=name, pos=nodes[node], gravcomp=1)
+      hand.add_geom(size=[1e-3, 0, 0], mass=_MASS, contype=0, conaffinity=0, rgba=(0, 0, 0, 0))
+      slide = mujoco.mjtJoint.mjJNT_SLIDE
+      hand.add_joint(name=name, type=slide, axis=way, damping=_DAMPING)
+      motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+      motor.set_to_motor()
+      spec.add_equality(
+        name=name, type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1=name, name2=f"{drain.THREAD}_{node}", solref=[0.002, 1],
+      )  # fmt: skip
+    for geom in spec.geoms:
+      if geom.name.startswith(f"{self.prefix}ring"):
+        geom.priority, geom.friction[0] = 1, _POLISHED
+        geom.solref, geom.solimp[:3] = CONTACT["solref"], CONTACT["solimp"]
+    return spec
+
+  def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Returns all of the drain, and the middle of the stitch."""
+    return np.arange(len(physics.organ.elem)), MIDDLE
+
+  def begin(self, physics: Physics) -> None:
+    """Lays the first throw, and puts the pusher's ring around the post above it."""
+    self.hand = int(self.random.choice([-1, 1]))  # the way round of the first throw
+    post, tail = strands(HIGH + self.random.uniform(-0.001, 0.001), self.hand)
+    places = drain.sew(physics.organ, _line(post, tail)).positions
+    marks = [np.linalg.norm(places - strand[0], axis=1).argmin() for strand in (post, tail)]
+    self.sides = np.arange(marks[0] - 2, -1, -1), np.arange(marks[1] + 2, len(places))
+    ring = post[-2] + self.random.uniform(0.5, 0.6) * (post[-1] - post[-2])
+    physics.set_joints(np.insert(trocar.inverse(physics.trocar(), ring), 2, 0.0))
+    self.pull(physics, PULL)
+    self.joints = {
+      name: np.array([(places[node] - physics.model.ptr.body(name).pos) @ way])
+      for name, node, way in _ends(len(places))
+    }
+    self.laid, self.seated, self.stayed, self.free = 1, 0, 0.0, 0.0
+    self.high0 = HIGH
+    self.gap, self.tension = drain.GAPE, 0.0
+    self.knot, self.held = "", math.nan
+    self.stitch, self.throw = MIDDLE, post[1:-1].mean(axis=0)
+
+  def pull(self, physics: Physics, force: float) -> None:
+    """Draws both strands with a force [N]."""
+    for name, *_ in _ends(0):
+      physics.data.ctrl[physics.model.ptr.actuator(name).id] = force
+
+  def look(self, physics: Physics) -> None:
+    """Finds the throw, the gap, the tension, and how far holes are torn."""
+    thread = suture(physics)
+    places = thread.positions
+    post, tail = (places[side] for side in self.sides)
+    near = np.linalg.norm(post[:, None] - tail[None], axis=2) < 0.5 * _TOUCH * EDGE
+    ring = np.linalg.norm(post - physics.tip_pos(), axis=1).argmin()
+    rows = np.flatnonzero(near[: ring + 1].any(axis=1))  # no throw is beyond it
+    self.throw = post[rows[-1]] if len(rows) else 0.5 * (post[0] + tail[0])
+    self.gap = drain.gap(physics.nodes(), self.scene.nodes)
+    self.tension = float(thread.tension.max())
+    self.broken = bool(thread.broken.any())
+    holes = physics.organ.pinholes
+    self.whole = len(holes) == 2
+    if holes:
+      self.stitch = np.mean([hole.at for hole in holes], axis=0)
+
+  def advance(self, physics: Physics) -> float:
+    """Follows the throw down; see the module's head."""
+    self.look(physics)
+    if self.broken or not self.whole:
+      self.outcome = "damage"
+      self.event(physics, "note", label="thread broken" if self.broken else "torn out of the drain")
+      return -1.0
+    high = float(self.throw[2] - self.stitch[2])
+    waits = self.laid == self.seated
+    down = high < _SEAT and self.gap < CLOSED
+    self.stayed = self.stayed + self.control_timestep if down and not waits else 0.0
+    if self.stayed > _STAYS - 1e-6:
+      self.seated, self.stayed = self.seated + 1, 0.0
+      self.event(physics, "target", self.gap, "throw")
+      waits = True
+    if self.seated == self.throws:
+      return self.judge(physics)
+    if waits:
+      if physics.tip_pos()[2] > drain.HIGH + _MARK:
+        self.tie(physics)
+      return self.seated / self.throws
+    return (self.seated + 0.9 * max(closeness(high, self.high0), 0.0)) / self.throws
+
+  def judge(self, physics: Physics) -> float:
+    """Lets the strands go and pulls the slit apart, to see whether the knot is right and holds."""
+    if self.throws == 1:
+      self.outcome = "success"
+      return 1.0
+    if not self.free:
+      self.pull(physics, 0.0)
+      self.held = 0.0
+    if self.gap < CLOSED:
+      self.held = _TEST * min(self.free / _RISES, 1.0)
+    self.free += self.control_timestep
+    drain.part(physics.organ, self.scene.nodes, _TEST * min(self.free / _RISES, 1.0))
+    if self.free > _TESTED - 1e-6 or self.gap > 2 * CLOSED:
+      places = knots.closed(suture(physics).positions, np.array([-1.0, 0.0, 0.0]))
+      self.knot = knots.name(places)
+      tied = [-self.hand * (-1) ** k for k in range(self.throws)]
+      right = sorted(knots.throws(places) or ()) == sorted(tied)
+      self.outcome = "success" if right and self.gap < CLOSED else "missed"
+    return 0.95
+
+  def tie(self, physics: Physics) -> None:
+    """Lays the next throw over the last one, the other way round, as the hands outside tie it."""
+    thread = suture(physics)
+    places = thread.positions
+    top = float(self.throw[2])
+    lines = again([places[side] for side in self.sides], top, self.hand * (-1) ** self.laid)
+    for side, (first, line) in zip(self.sides, lines, strict=True):
+      thread.lay(line, side[first:])
+    for name, node, way in _ends(len(places)):
+      place = thread.positions[node] - physics.model.ptr.body(name).pos
+      physics.data.joint(name).qpos[0] = place @ way
+      physics.data.joint(name).qvel[0] = 0.0
+    self.laid += 1
+    physics.forward()
+    self.look(physics)
+    self.high0 = float(self.throw[2] - self.stitch[2])
+
+  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
+    """Returns where the throw is and where it is to go."""
+    tip, goal = physics.tip_pos(), self.stitch
+    if self.laid == self.seated:
+      goal = self.mark
+    return {
+      "target": goal - tip,
+      "throw": self.throw - tip,
+      "gap": np.array([self.gap]),
+      "tension": np.array([self.tension]),
+      "seated": np.array([float(self.seated)]),
+    }
+
+  @property
+  def mark(self) -> np.ndarray:
+    """Where the pusher is to go back to [m]  (3,)."""
+    share = (drain.HIGH + _MARK + 0.002 - MIDDLE[2]) / _HANDS[2]
+    return MIDDLE + share * (_HANDS - np.array([0.5 * _APART, 0.0, 0.0]))
+
+  def show(self, physics: Physics) -> None:
+    """Marks where the pusher is to go back to."""
+    waits = self.laid == self.seated < self.throws
+    physics.mark(0, self.mark, waits, waits, 0.001)
+
+  def recorded(self, physics: Physics) -> dict[str, float]:
+    """Returns gap, tension and the pull on the drain."""
+    pull = float(np.linalg.norm(physics.organ.needles[0].force))
+    found = {"traction": pull, "gap": self.gap, "tension": self.tension}
+    return found | ({"security": self.held} if self.throws > 1 else {})
+
+  def instruct(self, physics: Physics) -> str:
+    """Says what is next."""
+    if self.laid == self.seated:
+      return "Take the pusher back up to the yellow mark"
+    return f"Push throw {self.laid} of {self.throws} down until the slit is closed"
+
+  def expert(self, p: Performer) -> Script:
+    """Takes the ring down the post, presses each throw home, and goes back up."""
+    while self.outcome is None:
+      yield from p.wait(0.2)
+      laid = self.laid
+      goal = np.array([0.0, 0.0, drain.HIGH + 0.001])
+      yield from p.move(goal, speed=0.02)
+      for _ in range(round(3.0 / p.dt)):
+        if self.seated == laid:
+          break
+        yield p.step()
+      if self.seated == self.throws:
+        yield from Performer.wait(p, math.inf)
+      yield from p.move(self.mark, speed=0.03)
+      for _ in range(round(0.5 / p.dt)):
+        if self.laid > laid:
+          break
+        yield p.step()
+
+
+# Strands, and throws around them.
+
+
+def suture(physics: Physics) -> palpate.Thread:
+  """Returns the thread."""
+  return palpate.Thread(physics.model.ptr, physics.data.ptr, drain.THREAD)
+
+
+def strands(high: float, hand: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns post and tail from the marks to the hands, with a throw at a height over the stitch.
+
+  Args:
+    high: of the throw's middle [m]
+    hand: 1 for a right-handed throw, -1 for a left-handed one
+  """
+  lean = high / _HANDS[2] * _HANDS
+  out = []
+  for side, turn in zip((1, -1), twist(MIDDLE + lean, hand), strict=True):
+    start = MIDDLE + np.array([0.5 * drain.BITE * side, 0.0, 0.0])
+    end = MIDDLE + _HANDS - np.array([0.5 * _APART * side, 0.0, 0.0])
+    out.append(np.concatenate([[start], turn, [end]]))
+  return out[0], out[1]
+
+
+def twist(middle: np.ndarray, hand: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns two strands that wind about each other by three half turns, from +x and from -x.
+
+  They go in below and come out above, on the other side.
+  """
+  u = np.linspace(0.0, 1.0, _TURNS)
+  angle = 3.0 * np.pi * u
+  x, y, z = _LONG * (0.5 - u), hand * _LOOSE * np.sin(angle), -_LOOSE * np.cos(angle)
+  return middle + np.stack([x, y, z], axis=1), middle + np.stack([-x, -y, z], axis=1)
+
+
+def again(strands: list[np.ndarray], top: float, hand: int) -> list[tuple[int, np.ndarray]]:
+  """Returns where strands are laid anew for another throw: from which of their nodes on, and how.
+
+  Args:
+    strands: nodes from the marks up, of post and tail  (n, 3) each
+    top: height of the throw before [m]
+    hand: see `strands`
+  """
+  low, high = top + 0.002, top + HIGH + 0.002
+  first = [int((strand[:, 2] > low).argmax()) for strand in strands]
+  last = [int((strand[:, 2] > high).argmax()) for strand in strands]
+  base = [strand[k] for strand, k in zip(strands, first, strict=True)]
+  ends = [strand[k] for strand, k in zip(strands, last, strict=True)]
+  below, above = np.mean(base, axis=0), np.mean(ends, axis=0)
+  turns = twist(below + 0.6 * (above - below), hand)
+  side = 1 if base[0][0] > base[1][0] else -1
+  turns = turns if side > 0 else turns[::-1]
+  out = []
+  for k in (0, 1):
+    cross = 0.5 * (turns[k][-1] + ends[k]) + np.array([0.0, _PAST * (1 - 2 * k), 0.0])
+    line = np.concatenate([[base[k]], turns[k], [cross], strands[k][last[k] :]])
+    out.append((first[k], line))
+  return out
+
+
+def _line(post: np.ndarray, tail: np.ndarray) -> np.ndarray:
+  """Returns the line of the whole thread from the post's end on [m]  (n, 3)."""
+  return np.concatenate([post[::-1], tail])
+
+
+def _ends(count: int) -> tuple[tuple[str, int, np.ndarray], ...]:
+  """Returns for each hand outside its name, the node of the thread in it, and its slide's way."""
+  post, tail = strands(HIGH, 1)
+  ways = [(strand[-1] - strand[-2]) for strand in (post, tail)]
+  ways = [way / np.linalg.norm(way) for way in ways]
+  return ("hand_post", 0, ways[0]), ("hand_tail", count - 1, ways[1])
