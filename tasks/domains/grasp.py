@@ -20,8 +20,8 @@ before it is lowered start the holding again. Failure: a force above the damage 
 included, or the time limit.
 
 Shaping: until it is grasped 0.36 * `ready`, for jaws that are open near the site, are over the fold
-and close on it; then 0.3 * (1 - min(height / lift, 1)), and less where the fold is pushed down; 0
-once held long enough.
+and close on it; then 0.3 * (1 - min(height / lift, 1)), less 0.15 * d / (1 + d) where the fold is
+pushed down by d lifts; 0 once held long enough.
 """
 
 import dataclasses
@@ -273,13 +273,14 @@ def advance(s, o):
 
 
 def shaping(s, o):
-  """Returns what tells the way to a grasp, and up from where the fold was pushed down."""
+  """Returns what tells the way to a grasp, and up from any depth that the fold was pushed to."""
   if o.done:
     return 0.0
   if o.grasped == 0.0:
     return 0.36 * ready(s, o)
   share = raised(s, o) / o.lift
-  return 0.3 * (1.0 - clamp(share, 0.0, 1.0)) + 0.1 * clamp(share, -0.4, 0.0)
+  pushed = max(-share, 0.0)
+  return 0.3 * (1.0 - clamp(share, 0.0, 1.0)) - 0.15 * pushed / (1.0 + pushed)
 
 
 def observe(s, o):

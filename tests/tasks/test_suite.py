@@ -165,10 +165,12 @@ def test_a_potential_shows_the_way_to_a_grasp():
 
   go(-0.68, ("beside, closed", 0.01, -0.68), ("pressed, closed", -0.006, -0.68))
   go(1.0, ("beside", 0.01, 1.0), ("over it", -0.006, 1.0), ("closing", -0.006, -0.2),
-     ("grasped", -0.006, -0.55), ("lifted", 0.001, -0.55))  # fmt: skip
+     ("grasped", -0.006, -0.55), ("lifted", 0.001, -0.55), ("pushed", -0.012, -0.55),
+     ("deep", -0.018, -0.55))  # fmt: skip
   order = ["beside, closed", "beside", "over it", "closing", "grasped", "lifted"]
   assert sorted(order, key=potential.__getitem__) == order
   assert potential["pressed, closed"] < potential["over it"] - 0.1
+  assert potential["deep"] < potential["pushed"] - 0.02 < potential["grasped"] - 0.04
 
 
 def test_quick_forms_agree_with_the_plain_ones():
