@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import pathlib
 import re
 import subprocess
@@ -106,12 +107,11 @@ def test_every_notebook_is_listed_and_tested():
 
 
 @pytest.mark.slow
-def test_ppo_learns_from_nothing_in_a_few_worlds_on_the_cpu(tmp_path):
+def test_ppo_learns_from_nothing_in_a_few_worlds_on_the_cpu():
   pytest.importorskip("torch")
-  curve = tmp_path / "ppo.csv"
-  options = ["--device", "warp-cpu", "--worlds", "4", "--steps", "4", "--minutes", "0.1"]
-  command = [sys.executable, str(FOLDER / "ppo.py"), "touch/easy", *options, "--out", str(curve)]
-  subprocess.run(command, check=True, timeout=600)
-  rows = list(csv.DictReader(curve.open()))
-  assert len(rows) >= 2 and int(rows[-1]["steps"]) == 16 * len(rows)
-  assert all(float(row["spread"]) > 0 and float(row["made"]) > 0 for row in rows)
+  options = ["--device", "cpu", "--worlds", "4", "--minutes", "0.1"]
+  command = [sys.executable, str(FOLDER / "ppo.py"), "touch/easy", *options]
+  curve = subprocess.run(command, check=True, timeout=600, stdout=subprocess.PIPE, text=True).stdout
+  rows = list(csv.DictReader(curve.splitlines()))
+  assert len(rows) >= 2 and int(rows[-1]["steps"]) == int(rows[0]["steps"]) * len(rows)
+  assert all(math.isfinite(float(row["paid"])) and float(row["made"]) > 0 for row in rows)

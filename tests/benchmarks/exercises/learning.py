@@ -51,16 +51,15 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
 
 def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Trains, and returns rows of the curve."""
-  with tempfile.TemporaryDirectory() as folder:
-    curve = pathlib.Path(folder) / "curve.csv"
-    options = {"device": "device", "worlds": "worlds", "seed": "seed", "minutes": "most"}
-    words = [word for name, key in options.items() for word in (f"--{name}", str(case[key]))]
-    command = [sys.executable, str(SCRIPT), case["task"], *words, "--out", str(curve)]
-    ended = subprocess.run(command, capture_output=True, text=True)
+  options = {"device": "device", "worlds": "worlds", "seed": "seed", "minutes": "most"}
+  words = [word for name, key in options.items() for word in (f"--{name}", str(case[key]))]
+  command = [sys.executable, str(SCRIPT), case["task"], *words]
+  with tempfile.TemporaryFile("w+", encoding="utf-8") as curve:
+    ended = subprocess.run(command, stdout=curve, stderr=subprocess.PIPE, text=True)
     if ended.returncode:
       raise RuntimeError(ended.stderr.strip().rpartition("\n")[2])
-    with open(curve, newline="", encoding="utf-8") as file:
-      found = list(csv.DictReader(file))
+    curve.seek(0)
+    found = list(csv.DictReader(curve))
   apart = max(1, len(found) // POINTS)
   return [
     {key: case[key] for key in ("task", "seed", "worlds")}
