@@ -128,7 +128,7 @@ class Extracorporeal(Task):
     self.laid, self.seated, self.stayed, self.free = 1, 0, 0.0, 0.0
     self.high0 = HIGH
     self.gap, self.tension = drain.GAPE, 0.0
-    self.knot, self.held = "", math.nan
+    self.knot, self.held = "", 0.0
     self.stitch, self.throw = MIDDLE, post[1:-1].mean(axis=0)
 
   def pull(self, physics: Physics, force: float) -> None:
@@ -183,7 +183,6 @@ class Extracorporeal(Task):
       return 1.0
     if not self.free:
       self.pull(physics, 0.0)
-      self.held = 0.0
     if self.gap < CLOSED:
       self.held = _TEST * min(self.free / _RISES, 1.0)
     self.free += self.control_timestep
