@@ -116,8 +116,8 @@ class Distillation(Student):
     torch.backends.cudnn.benchmark = True  # sizes stay what they are
     self._kept: collections.deque[dict[str, Any]] = collections.deque(maxlen=_KEPT)
     self._random = torch.Generator(device).manual_seed(settings.seed)
-    self._alone = torch.arange(self.env.num_envs, device=device) < _ALONE * self.env.num_envs
-    self._helped, self._left = torch.ones_like(self._alone), False
+    self.alone = torch.arange(self.env.num_envs, device=device) < _ALONE * self.env.num_envs
+    self.helped, self._left = torch.ones_like(self.alone), False
     self.env.stagger(torch.Generator().manual_seed(settings.seed))
 
   @property
@@ -155,7 +155,7 @@ class Distillation(Student):
     for _ in range(UPDATES):
       self.update()
     self.steps += STEPS * self.env.num_envs
-    return float(self.env.won[self._alone].mean()) if self._left else 0.0
+    return float(self.env.won[self.alone].mean()) if self._left else 0.0
 
   @torch.no_grad()
   def _collect(self, ended: list, stop: Callable[[], bool]) -> dict[str, torch.Tensor] | None:
@@ -168,13 +168,13 @@ class Distillation(Student):
     first = torch.zeros(size, device=env.device) if state is None else state[0].clone()
     begun = torch.zeros(env.num_envs, device=env.device)
     if self.iteration and self._done > _ACTS / 2 and not self._left:  # alone from now on
-      self._left, env.won[self._alone], env.whole[self._alone] = True, 0.0, False
+      self._left, env.won[self.alone], env.whole[self.alone] = True, 0.0, False
     for _ in range(STEPS):
       if stop():
         return None
       seen = env.get_observations()
       says = self._teacher(TensorDict({ACTING: seen[TEACHER]}, batch_size=[env.num_envs]))
-      said = torch.where(self._helped[:, None], says, actor(seen)) if self.iteration else says
+      said = torch.where(self.helped[:, None], says, actor(seen)) if self.iteration else says
       row = {group: seen[group] for group in (ACTING, PICTURES, MORE)}
       for name, value in {**row, "says": says.clamp(-1.0, 1.0), "begun": begun}.items():
         rows[name].append(value)
@@ -189,10 +189,10 @@ class Distillation(Student):
         ended.append(extras["log"])
       drawn = torch.rand(2, env.num_envs, generator=self._random, device=env.device)
       again = over.bool() | (drawn[0] < 1 / _TURN)
-      self._helped = torch.where(again, drawn[1] < helps, self._helped)
-      self._helped |= self._idle > STUCK
+      self.helped = torch.where(again, drawn[1] < helps, self.helped)
+      self.helped |= self._idle > STUCK
       if self._left:
-        self._helped &= ~self._alone
+        self.helped &= ~self.alone
     return {name: torch.stack(values) for name, values in rows.items()} | {"state": first[None]}
 
   def _watch(self, progress: torch.Tensor) -> None:

@@ -145,7 +145,7 @@ def test_what_the_teacher_says_is_learned_from_pictures(monkeypatch):
   assert found.env.episode_length_buf.max() <= 1
   monkeypatch.setattr(distillation, "STUCK", -1)  # as if nobody had got on for long
   found.iterate()
-  assert torch.equal(found._helped, ~found._alone)
+  assert torch.equal(found.helped, ~found.alone)
   env.close()
 
 
