@@ -66,8 +66,10 @@ from .needles import (
   arrive,
   carry,
   grasped,
-  needle,
+  half_angle,
+  piercing,
   right_grasp,
+  tip_angle,
 )
 
 BITE = 0.012  # between the marks [m]; FLS: 5 mm on either side of a slit
@@ -252,18 +254,13 @@ class Drive(Needlework):
     middle = np.array([*self.random.uniform(-0.005, 0.005, 2), 0.0])
     self.way = -np.array([math.cos(angle), math.sin(angle), 0.0])
     self.marks = middle + np.outer([-0.5, 0.5], BITE * self.way)
-    place, mat = posed(self, -self.half - math.radians(20.0))
+    place, mat = piercing(self.marks, -half_angle(self.marks) - math.radians(20.0))
     place = place + np.array([0.0, 0.0, _OVER]) + self.random.uniform(-0.003, 0.003, 3)
     tip = self.take_up(physics, (place, mat), _HELD_AT, lean=0.15, along=0.1)
     self.holes, self.misses = 0, np.zeros(2)
     self.out = self.deepest = self.pull = self.pulled = self.pierced = 0.0
     self.holds, self.target, self.circle, self.middle = 1.0, *np.zeros((3, 3))
     self.start0 = float(np.linalg.norm(tip - self.marks[0]))
-
-  @property
-  def half(self) -> float:
-    """Half of the angle that the bite has on the needle's circle [rad]."""
-    return math.asin(0.5 * BITE / RADIUS)
 
   def mark_size(self, k: int) -> float:
     """Returns the radius of a mark [m]."""
@@ -289,16 +286,16 @@ class Drive(Needlework):
 
   def expert(self, p: Performer) -> Script:
     """Puts the needle over the first mark, and turns it about its circle through both."""
-    start = -self.half - math.radians(12.0)
-    end = self.half + (WANTED + _MORE) / RADIUS
+    half = half_angle(self.marks)
+    start, end = -half - math.radians(12.0), half + (WANTED + _MORE) / RADIUS
     if not self.holes:
-      over = posed(self, start)
+      over = piercing(self.marks, start)
       yield from carry(p, lambda t: (over[0] + np.array([0.0, 0.0, 0.006]), over[1]))
       yield from arrive(p)
       yield from carry(p, lambda t: over)
     while True:  # looking again how the needle lies in the jaws
       yield from arrive(p)
-      now = tip_angle(self, p.physics)
+      now = tip_angle(p.physics, self.marks)
       if now > end - 0.01:
         return
       stop = min(now + _LOOK, end)
@@ -307,25 +304,4 @@ class Drive(Needlework):
 
 def _turned(task: Drive, start: float, stop: float, t: float) -> Pose:
   """Returns the pose of a needle that is a share of the way between two angles of its tip."""
-  return posed(task, start + t * (stop - start))
-
-
-def posed(task: Drive, tip: float) -> Pose:
-  """Returns the needle's pose with its circle through both marks, by the angle of its tip.
-
-  The angle is that at the middle of the circle, from straight down towards the second mark [rad].
-  """
-  up = np.array([0.0, 0.0, 1.0])
-  axis = np.cross(task.way, up)  # about which it turns: down goes to `way`
-  middle = task.marks.mean(axis=0) + RADIUS * math.cos(task.half) * up
-  # The tip is a quarter turn ahead of the middle of the arc.
-  angle = tip - math.pi / 2
-  x = -math.cos(angle) * up + math.sin(angle) * task.way
-  return middle, np.column_stack([x, np.cross(axis, x), axis])
-
-
-def tip_angle(task: Drive, physics: Any) -> float:
-  """Returns the angle of the needle's tip, see `posed`."""
-  pos, _ = needle(physics)
-  tip = arc(physics, 1.0) - pos
-  return math.atan2(float(tip @ task.way), -float(tip[2]))
+  return piercing(task.marks, start + t * (stop - start))

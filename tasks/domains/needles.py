@@ -242,3 +242,29 @@ def _steps(p: Performer, way: np.ndarray, angle: float) -> int:
   """Returns how many control steps a hand takes for a way [m] and a turn [rad]."""
   duration = max(float(np.linalg.norm(way)) / _SPEED, angle / _TURN) / p.style.speed
   return max(2, round(duration / p.dt))
+
+
+def half_angle(ends: np.ndarray) -> float:
+  """Returns half of the angle between two marks (2, 3) on the needle's circle [rad]."""
+  return math.asin(min(0.5 * float(np.linalg.norm(ends[1] - ends[0])) / RADIUS, 0.9))
+
+
+def piercing(ends: np.ndarray, tip: float) -> Pose:
+  """Returns the needle's pose with its circle through two marks (2, 3), by the angle of its tip.
+
+  The angle is that at the middle of the circle, from straight down towards the second mark [rad].
+  """
+  way, up = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0]), np.array([0.0, 0.0, 1.0])
+  axis = np.cross(way, up)  # about which it turns: down goes to `way`
+  middle = 0.5 * (ends[0] + ends[1]) + RADIUS * math.cos(half_angle(ends)) * up
+  angle = tip - QUARTER  # the tip is a quarter turn ahead of the middle of the arc
+  x = -math.cos(angle) * up + math.sin(angle) * way
+  return middle, np.column_stack([x, np.cross(axis, x), axis])
+
+
+def tip_angle(physics: Any, ends: np.ndarray) -> float:
+  """Returns the angle of the needle's tip, see `piercing`, from -90 to 270 degrees [rad]."""
+  way, tip = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0]), arc(physics, 1.0)
+  tip = tip - needle(physics)[0]
+  angle = math.atan2(float(tip @ way), -float(tip[2]))
+  return angle if angle > -QUARTER else angle + 4.0 * QUARTER

@@ -82,12 +82,15 @@ from .needles import (
   carry,
   grasp,
   grasped,
+  half_angle,
   jaws,
   left_grasp,
   move_tip,
   needle,
   one,
+  piercing,
   right_grasp,
+  tip_angle,
 )
 
 STITCHES, PITCH, BITE = 4, 0.006, 0.004  # [m]: between stitches, and from the edge of the cut
@@ -329,7 +332,7 @@ class Running(Needlework):
     organ = palpate.Organ(made.model, data, self.organ)
     seat, share = _seats(organ.xpos0, organ.elem, self._planned(organ.xpos0))
     at = (share[..., None] * organ.xpos[organ.elem[seat]]).sum(axis=1)
-    self.held = posed(at[2 * self.placed :], -math.radians(60.0))
+    self.held = piercing(at[2 * self.placed :], -math.radians(60.0))
     self.held = self.held[0] + np.array([-0.003, 0.0, _HIGH]), self.held[1]
     pos, mat = self.held
     data.joint("needle").qpos[:] = np.concatenate([pos, trocar.orientation(mat)])
@@ -425,11 +428,8 @@ class Running(Needlework):
     return np.array([place(p.physics, self, first + k) for k in range(2)])
 
   def _angle(self, p: Performer) -> float:
-    """Returns the angle of the needle's tip, see `posed`, from -90 to 270 degrees."""
-    ends, tip = self._ends(p), arc(p.physics, 1.0) - needle(p.physics)[0]
-    way = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    angle = math.atan2(float(tip @ way), -float(tip[2]))
-    return angle if angle > -math.pi / 2 else angle + 2 * math.pi
+    """Returns the angle of the needle's tip, see `piercing`."""
+    return tip_angle(p.physics, self._ends(p))
 
   def _turn(self, p: Performer, end: float) -> Script:
     """Turns the needle on about its circle; looks how the needle lies in the jaws meanwhile."""
@@ -437,7 +437,7 @@ class Running(Needlework):
     stop = min(start + _LOOK, end)
 
     def way(t: float) -> Pose:
-      return posed(self._ends(p, first), start + t * (stop - start))
+      return piercing(self._ends(p, first), start + t * (stop - start))
 
     yield from carry(p, way, stop - start)
     yield from arrive(p)
@@ -446,7 +446,7 @@ class Running(Needlework):
     """Puts the needle over the first mark, and turns it about its circle through both."""
     if self.holes <= 2 * self.done:
       ends = self._ends(p)
-      pos, mat = posed(ends, -half(ends) - math.radians(14.0))
+      pos, mat = piercing(ends, -half_angle(ends) - math.radians(14.0))
       yield from carry(p, lambda t: (pos + np.array([0.0, 0.0, 0.006]), mat))
       yield from arrive(p)
       yield from carry(p, lambda t: (pos, mat))
@@ -468,7 +468,7 @@ class Running(Needlework):
 
   def _draw(self, p: Performer) -> Script:
     """Turns the needle out of the wall, and draws the thread after it."""
-    done, end = self.done, half(self._ends(p)) + math.radians(185.0)
+    done, end = self.done, half_angle(self._ends(p)) + math.radians(185.0)
     while self.done == done and self._angle(p) < end - 0.05:
       yield from self._turn(p, end)
     while self.done == done:
@@ -477,7 +477,7 @@ class Running(Needlework):
 
   def _hand(self, p: Performer) -> Script:
     """Brings the needle over the next stitch, to where the right hand can take it."""
-    pos, mat = posed(self._ends(p), math.radians(90.0))
+    pos, mat = piercing(self._ends(p), math.radians(90.0))
     pos = pos + np.array([0.0, 0.0, _OVER])
     yield from carry(p, lambda t: (pos + np.array([0.0, 0.0, 0.01]), mat))
     yield from carry(p, lambda t: (pos, mat))
@@ -545,24 +545,6 @@ def _bow(start: np.ndarray, end: np.ndarray, angle: float) -> np.ndarray:
   middle = 0.5 * (start + end) - radius * math.cos(angle) * aside
   bow = middle + radius * (np.sin(turn) * along + np.cos(turn) * aside)
   return np.column_stack([bow[:, :2], np.maximum(bow[:, 2], 0.9 * _RISE)])
-
-
-def half(ends: np.ndarray) -> float:
-  """Returns half of the angle between two marks on the needle's circle [rad]."""
-  return math.asin(min(0.5 * float(np.linalg.norm(ends[1] - ends[0])) / RADIUS, 0.9))
-
-
-def posed(ends: np.ndarray, tip: float) -> Pose:
-  """Returns the needle's pose with its circle through two marks, by the angle of its tip.
-
-  The angle is that at the middle of the circle, from straight down towards the second mark [rad].
-  """
-  way, up = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0]), np.array([0.0, 0.0, 1.0])
-  axis = np.cross(way, up)
-  middle = 0.5 * (ends[0] + ends[1]) + RADIUS * math.cos(half(ends)) * up
-  angle = tip - math.pi / 2
-  x = -math.cos(angle) * up + math.sin(angle) * way
-  return middle, np.column_stack([x, np.cross(axis, x), axis])
 
 
 def park(port: Any) -> Pose:
