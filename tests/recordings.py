@@ -50,6 +50,7 @@ def exercise(steps=300, instruments=("left", "right"), seed=0, journal=None):
       ring_force=rng.rand(len(instruments)),
       gap=rng.rand(len(instruments)),
       tension=rng.rand(len(instruments)),
+      security=rng.rand(len(instruments)),
       torn=rng.rand(len(instruments)),
       grip=np.full(len(instruments), k % 100 < 60),
       held=np.full(len(instruments), 10 < k % 100 < 40),

@@ -23,9 +23,10 @@ SLIT, GAPE = 0.0084, 0.0024  # of the slit: length, and how far it gapes in its 
 MIDDLE = np.array([0.0, 0.0, HIGH - DEEP])  # of the stitch [m]
 BITE = WIDE * float(np.sqrt(1.0 - (1.0 - 2.0 * DEEP / HIGH) ** 2))  # between the marks [m]
 # Latex: 1 MPa is what rubbers of gloves and drains have at small strain; the wall is measured.
-# Thread of silk sticks in it: friction and toughness are ours.
+# It tears at some 10 kJ/m^2, as natural rubber does (Rivlin and Thomas 1953,
+# 10.1002/pol.1953.120100303). Thread of silk sticks in it: friction is ours.
 LATEX = {"young": 1e6, "thickness": 0.0005, "damping": 0.003}
-TOUGH, FRICTION = 4000.0, 600.0  # [J/m^2], [N/m]
+TOUGH, FRICTION = 10000.0, 600.0  # [J/m^2], [N/m]
 MASS = 0.0003  # of the tube, 1000 kg/m^3 [kg]
 # Hook and loop under it: some 30 kPa hold it [N/m^3, Pa, J/m^2].
 HELD = (1e8, 3e4, 60.0)

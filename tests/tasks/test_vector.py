@@ -18,7 +18,7 @@ from palpate.tasks.domains import trace  # noqa: E402
 LIMITS = {"contact_force": 0.02, "shaft_force": 0.02, "peak_force": 0.02, "gripper": 0.1}
 LIMITS |= {"joint_vel": 5e-3, "traction": 0.02}
 # A needle of 2 g that slips between jaws magnifies it too.
-SLIPS = {"circle": 0.01, "gripper": 0.4, "joint_vel": 0.02, "progress": 3e-3, "out": 0.01,
+SLIPS = {"circle": 0.01, "gripper": 0.5, "joint_vel": 0.02, "progress": 3e-3, "out": 0.01,
          "tip_vel": 1e-3}  # fmt: skip
 WIDER = {"suture/drive_easy": SLIPS, "suture/running_easy": SLIPS | {"gripper": 1.0, "way": 1e-3}}
 ENDING = "touch/easy", "trace/easy", "grasp/easy", "retract/easy", "dissect/easy"
