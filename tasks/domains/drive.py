@@ -31,7 +31,6 @@ from ..core.base import Physics
 from ..core.performer import Performer, Script
 from ..core.rules import (
   DAMAGED,
-  FAR,
   HIDDEN,
   LATER,
   MISSED,
@@ -46,27 +45,30 @@ from ..core.rules import (
   needle_place,
   pierced,
   pinhole,
-  reach,
-  root,
   vector,
 )
 from ..core.scenes import Scene
 from ..registry import exercise
 from . import sheet
 from .needles import (
+  FRICTION,
   LOST,
+  MARK,
   MEETS,
-  PIECES,
   QUARTER,
   RADIUS,
+  TOUGH,
+  WALL,
   Hands,
-  Needlework,
   Pose,
+  Stitching,
   arc,
   arrive,
   carry,
   grasped,
   half_angle,
+  lowest,
+  open_holes,
   piercing,
   right_grasp,
   tip_angle,
@@ -74,11 +76,6 @@ from .needles import (
 
 BITE = 0.012  # between the marks [m]; FLS: 5 mm on either side of a slit
 WANTED = 0.005  # how far the tip is to come out [m]
-MARK = 0.0008  # radius of a mark, and how far above the wall it is [m]
-# Energy that it takes to open an area of the wall [J/m^2], and friction in it [N/m]; skin takes
-# 2500, liver 75 to 185 (10.1007/978-3-540-70521-5_18).
-TOUGH, FRICTION = 800.0, 15.0
-WALL = {"young": 4e5, "thickness": 0.0015, "tension": 20.0, "damping": 0.005, "foundation": 5e4}
 FIELD = Scene(
   organ="sheet", instrument="psm", port=(-0.035, 0.1, 0.07), camera=(0.04, 0.06, 0.06), nodes=400
 )
@@ -132,28 +129,6 @@ class State(Hands):
 # The rules.
 
 
-def open_holes(s, o, count):
-  """Compares holes that are new with their marks; returns how far one is off at most [m]."""
-  for k in range(o.holes, count):
-    place, _ = pinhole(s, k)
-    off = place - o.marks[k]
-    o.misses[k] = root(off[0] * off[0] + off[1] * off[1])
-    reach(s, o, o.misses[k])
-  o.holes = count
-  worst = float(0.0)  # noqa: UP018 - a variable to Warp
-  for k in range(count):
-    worst = max(worst, o.misses[k])
-  return o, worst
-
-
-def lowest(s):
-  """Returns the height of the needle's lowest piece over the wall [m]."""
-  least = float(FAR)
-  for k in range(PIECES + 1):
-    least = min(least, float(arc(s, float(k) / float(PIECES))[2]))
-  return least
-
-
 def advance(s, o):
   """Follows the needle through the wall."""
   o = grasped(s, o, right_grasp(s), 0.0)
@@ -197,7 +172,7 @@ def mark(s, o, k):
   return o.marks[k] + vector(0.0, 0.0, MARK), NOW if k == o.holes else look
 
 
-class Drive(Needlework):
+class Drive(Stitching):
   """Drive a needle through two marks."""
 
   rules = Rules(
@@ -244,10 +219,6 @@ class Drive(Needlework):
     palpate.add_needle(spec, pos=apart, quat=(1, 1, 0, 0), contact=meets)
     return spec
 
-  def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
-    """Returns all of the wall, and its middle."""
-    return np.arange(len(physics.organ.elem)), np.zeros(3)
-
   def begin(self, physics: Physics) -> None:
     """Draws the marks and how the jaws hold the needle."""
     angle = self.random.uniform(-self.turn, self.turn)
@@ -261,16 +232,6 @@ class Drive(Needlework):
     self.out = self.deepest = self.pull = self.pulled = self.pierced = 0.0
     self.holds, self.target, self.circle, self.middle = 1.0, *np.zeros((3, 3))
     self.start0 = float(np.linalg.norm(tip - self.marks[0]))
-
-  def mark_size(self, k: int) -> float:
-    """Returns the radius of a mark [m]."""
-    return MARK
-
-  def label(self, kind: str) -> str:
-    """Returns what an event of the rules is called."""
-    if kind == "damage":
-      return f"torn by a pull of {self.pull:.2f} N"
-    return "hole" if kind == "target" else super().label(kind)
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns the needle's pull on the wall, and how deep it went."""

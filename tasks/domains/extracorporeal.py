@@ -24,7 +24,6 @@ import math
 
 import mujoco
 import numpy as np
-import palpate
 from palpate.models import trocar
 
 from ..core.base import Physics, Task
@@ -138,7 +137,8 @@ class Extracorporeal(Task):
 
   def look(self, physics: Physics) -> None:
     """Finds the throw, the gap, the tension, and how far holes are torn."""
-    thread = suture(physics)
+    thread = physics.thread
+    assert thread
     places = thread.positions
     post, tail = (places[side] for side in self.sides)
     near = np.linalg.norm(post[:, None] - tail[None], axis=2) < 0.5 * _TOUCH * EDGE
@@ -188,7 +188,8 @@ class Extracorporeal(Task):
     self.free += self.control_timestep
     drain.part(physics.organ, self.scene.nodes, _TEST * min(self.free / _RISES, 1.0))
     if self.free > _TESTED - 1e-6 or self.gap > 2 * CLOSED:
-      places = knots.closed(suture(physics).positions, np.array([-1.0, 0.0, 0.0]))
+      assert physics.thread
+      places = knots.closed(physics.thread.positions, np.array([-1.0, 0.0, 0.0]))
       self.knot = knots.name(places)
       tied = [-self.hand * (-1) ** k for k in range(self.throws)]
       right = sorted(knots.throws(places) or ()) == sorted(tied)
@@ -197,7 +198,8 @@ class Extracorporeal(Task):
 
   def tie(self, physics: Physics) -> None:
     """Lays the next throw over the last one, the other way round, as the hands outside tie it."""
-    thread = suture(physics)
+    thread = physics.thread
+    assert thread
     places = thread.positions
     top = float(self.throw[2])
     lines = again([places[side] for side in self.sides], top, self.hand * (-1) ** self.laid)
@@ -269,11 +271,6 @@ class Extracorporeal(Task):
 
 
 # Strands, and throws around them.
-
-
-def suture(physics: Physics) -> palpate.Thread:
-  """Returns the thread."""
-  return palpate.Thread(physics.model.ptr, physics.data.ptr, drain.THREAD)
 
 
 def strands(high: float, hand: int) -> tuple[np.ndarray, np.ndarray]:

@@ -13,15 +13,19 @@ import numpy as np
 from palpate.engine.model.flexes import matrix
 from palpate.models import trocar, wrist
 
-from ..core.base import Task
+from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
 from ..core.rules import (
+  FAR,
   drop,
   length,
   needle_place,
   other_pinch,
   other_tip,
   pinch,
+  pinhole,
+  reach,
+  root,
   sine,
   tip,
   vector,
@@ -34,6 +38,11 @@ HELD, NEAR = 1.0, 0.008  # of jaws that hold the needle: least force [N], farthe
 LOST = 0.5  # how long nobody may hold it [s]
 MEETS = 8  # bit of what meets the needle, besides bit 1 of what meets the organ
 WIDE = 0.15  # action of the jaws: open
+MARK = 0.0008  # radius of a mark, and how far above the wall it is [m]
+# Energy that it takes to open an area of the wall [J/m^2], and friction in it [N/m]; skin takes
+# 2500, liver 75 to 185 (10.1007/978-3-540-70521-5_18).
+TOUGH, FRICTION = 800.0, 15.0
+WALL = {"young": 4e5, "thickness": 0.0015, "tension": 20.0, "damping": 0.005, "foundation": 5e4}
 _OPENING = 0.056  # of each jaw, just off the wire [rad]
 _BITE = 0.0036  # from the tip of the jaws to the wire between them [m]
 _SPEED, _TURN, _CLOSE = 0.03, 1.2, 3.0  # of an expert's hand [m/s, rad/s] and jaws [1/s]
@@ -89,6 +98,28 @@ def grasped(s, o, right, left):
   return o
 
 
+def open_holes(s, o, count):
+  """Compares holes that are new with their marks; returns how far one is off at most [m]."""
+  for k in range(o.holes, count):
+    place, _ = pinhole(s, k)
+    off = place - o.marks[k]
+    o.misses[k] = root(off[0] * off[0] + off[1] * off[1])
+    reach(s, o, o.misses[k])
+  o.holes = count
+  worst = float(0.0)  # noqa: UP018 - a variable to Warp
+  for k in range(count):
+    worst = max(worst, o.misses[k])
+  return o, worst
+
+
+def lowest(s):
+  """Returns the height of the needle's lowest piece over the wall [m]."""
+  least = float(FAR)
+  for k in range(PIECES + 1):
+    least = min(least, float(arc(s, float(k) / float(PIECES))[2]))
+  return least
+
+
 class Needlework(Task):
   """An exercise with a needle; a domain that derives from it has the state `Hands`."""
 
@@ -135,6 +166,26 @@ class Needlework(Task):
   def label(self, kind: str) -> str:
     """Returns what a drop is."""
     return "needle" if kind == "drop" else super().label(kind)
+
+
+class Stitching(Needlework):
+  """An exercise that drives a needle through marks of a wall; `pull` is that on it [N]."""
+
+  pull: float
+
+  def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Returns all of the wall, and its middle."""
+    return np.arange(len(physics.organ.elem)), np.zeros(3)
+
+  def mark_size(self, k: int) -> float:
+    """Returns the radius of a mark [m]."""
+    return MARK
+
+  def label(self, kind: str) -> str:
+    """Returns what an event of the rules is called."""
+    if kind == "damage":
+      return f"torn by a pull of {self.pull:.2f} N"
+    return "hole" if kind == "target" else super().label(kind)
 
 
 # Where the needle is, and how it is held.

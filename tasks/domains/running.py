@@ -58,8 +58,6 @@ from ..core.rules import (
   needle_place,
   pierced,
   pinhole,
-  reach,
-  root,
   taut,
   torn_at,
   vector,
@@ -68,16 +66,19 @@ from ..core.scenes import Scene
 from ..core.stage import STATE, Stage
 from ..registry import exercise
 from . import sheet
-from .drive import FRICTION, MARK, TOUGH, WALL, lowest
 from .needles import (
+  FRICTION,
   LOST,
+  MARK,
   MEETS,
   QUARTER,
   RADIUS,
+  TOUGH,
+  WALL,
   WIDE,
   Hands,
-  Needlework,
   Pose,
+  Stitching,
   arc,
   arrive,
   carry,
@@ -86,9 +87,11 @@ from .needles import (
   half_angle,
   jaws,
   left_grasp,
+  lowest,
   move_tip,
   needle,
   one,
+  open_holes,
   piercing,
   right_grasp,
   tip_angle,
@@ -180,20 +183,6 @@ def widest(s, o):
   return most
 
 
-def new_holes(s, o, count):
-  """Compares holes that are new with their marks; returns how far one is off at most [m]."""
-  for k in range(o.holes, count):
-    at, _ = pinhole(s, k)
-    off = at - o.marks[k]
-    o.misses[k] = root(off[0] * off[0] + off[1] * off[1])
-    reach(s, o, o.misses[k])
-  o.holes = count
-  worst = float(0.0)  # noqa: UP018 - a variable to Warp
-  for k in range(2 * o.placed, count):
-    worst = max(worst, o.misses[k])
-  return o, worst
-
-
 def advance(s, o):
   """Follows needle and thread through the wall, and the gap."""
   o = grasped(s, o, right_grasp(s), left_grasp(s))
@@ -205,7 +194,7 @@ def advance(s, o):
   number = o.marks.shape[0]
   for k in range(count):
     o.torn = max(o.torn, torn_at(s, k))
-  o, worst = new_holes(s, o, min(count, number))
+  o, worst = open_holes(s, o, min(count, number))
   if o.holes > 2 * o.done:
     o.deepest = max(o.deepest, -lowest(s))
   o.through = 0.0
@@ -259,7 +248,7 @@ def mark(s, o, k):
   return place(s, o, k) + vector(0.0, 0.0, MARK), NOW if k == o.holes else look
 
 
-class Running(Needlework):
+class Running(Stitching):
   """Close a cut with a running suture."""
 
   rules = Rules(
@@ -321,10 +310,6 @@ class Running(Needlework):
     palpate.add_needle(spec, pos=tuple(apart), quat=(1, 1, 0, 0), thread="suture", contact=meets)
     return spec
 
-  def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
-    """Returns all of the wall, and its middle."""
-    return np.arange(len(physics.organ.elem)), np.zeros(3)
-
   def _stage(self, spec: mujoco.MjSpec) -> Stage:
     """Returns the stage: the cut gapes, and the stitches that are placed are sewn."""
     made = super()._stage(spec)
@@ -372,16 +357,6 @@ class Running(Needlework):
     port, aside = second.trocar(), self.random.uniform(-0.005, 0.005, 3)
     pos, turn = park(port)
     second.set_joints(wrist.inverse(port, pos + aside, turn))
-
-  def mark_size(self, k: int) -> float:
-    """Returns the radius of a mark [m]."""
-    return MARK
-
-  def label(self, kind: str) -> str:
-    """Returns what an event of the rules is called."""
-    if kind == "damage":
-      return f"torn by a pull of {self.pull:.2f} N"
-    return "hole" if kind == "target" else super().label(kind)
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns pull, bite, gap, tension and tears."""

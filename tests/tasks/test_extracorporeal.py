@@ -24,7 +24,7 @@ def test_the_expert_takes_a_throw_down_and_replays_to_the_bit(tmp_path):
   env = load()
   made = episode.run(env, performer.make(env, seed=0), 0, {"task_kwargs": {"surroundings": "none"}})
   assert made.outcome == "success"
-  thread = extracorporeal.suture(env.physics)
+  thread = env.physics.thread
   assert tied(thread.positions) == (-env.task.hand,) and not thread.broken.any()
   found = made.metrics()
   assert found.final_gap < 1e-3
@@ -40,7 +40,7 @@ def test_the_second_throw_is_tied_the_other_way_round_and_they_hold():
   env = load(throws=2)
   made = episode.run(env, performer.make(env, seed=0), 0, {"task_kwargs": {}})
   assert made.outcome == "success"
-  assert tied(extracorporeal.suture(env.physics).positions) == (1, -1)
+  assert tied(env.physics.thread.positions) == (1, -1)
   found = made.metrics()
   assert found.knot_security == pytest.approx(0.1) and found.final_gap < 1e-3
 
