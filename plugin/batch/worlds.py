@@ -216,10 +216,11 @@ class Worlds(Batch):
 
   def _callbacks(self):
     organs = list(self._organs.values())
+    order = self._order if strip_organs.tools_meet(self.bare) else None
 
     def touch(m, d):
-      if self._order:
-        self._order.sort_contacts()
+      if order:
+        order.sort_contacts()
       for organ in organs:
         organ.touch()
 

@@ -372,9 +372,7 @@ def _words(array: wp.array) -> wp.array:
   """Returns an array of numbers of 32 bits in words, a row an element."""
   count = wp.types.type_size_in_bytes(array.dtype) // 4
   shape = array.shape[0], count
-  out: Any = wp.array(ptr=array.ptr, dtype=int, shape=shape, device=array.device)
-  out.of = array
-  return out
+  return wp.array(ptr=array.ptr, dtype=int, shape=shape, device=array.device)
 
 
 def _columns(kind: Any, arrays: list[wp.array]) -> wp.array:
@@ -426,7 +424,6 @@ class FixedOrder:
       place=np.zeros(d.naconmax),
       kept=np.zeros((sum(array.shape[1] for array in words), d.naconmax)),
     ))  # fmt: skip
-    self._held = words
 
   def sort_contacts(self) -> None:
     """Launches what puts contacts in order, once those of geoms are found and before others are."""
