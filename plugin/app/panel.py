@@ -109,7 +109,7 @@ def _write(out: pathlib.Path, task: str, args: argparse.Namespace, results: list
   from palpate.tasks import suite
   from palpate.tasks.files import replacing
   from palpate.tasks.metrics import Metrics
-  from palpate.tasks.people.score import SUCCESS, make_reference
+  from palpate.tasks.people.score import SUCCESS, make_reference, to_json
 
   good = [Metrics.from_json(r.metrics) for r in results if r.outcome == SUCCESS]
   said = f"{task}: {len(good)} of {len(results)} episodes succeeded"
@@ -121,5 +121,5 @@ def _write(out: pathlib.Path, task: str, args: argparse.Namespace, results: list
   data |= {"palpate": palpate.__version__, "mujoco": mujoco.__version__}
   path = out / f"{task.replace('/', '_')}.json"
   with writing(path), replacing(path) as file:
-    file.write(json.dumps(data, indent=1) + "\n")
+    file.write(to_json(data))
   print(f"{path}  {said}")

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from ..metrics import METRICS, Metrics, check_header
+from . import score
 from .score import check_reference, make_reference, read_reference, reference
 
 FORMAT, VERSION = "palpate-references", 1
@@ -78,8 +79,7 @@ def of_people(results: Sequence[Metrics], task: str, text: str = "panel") -> dic
 
 def to_json(references: Mapping[str, Mapping[str, Any]]) -> str:
   """Returns the text of a file of references."""
-  data = {"format": FORMAT, "version": VERSION, "references": dict(references)}
-  return json.dumps(data, indent=1, allow_nan=False) + "\n"
+  return score.to_json({"format": FORMAT, "version": VERSION, "references": references})
 
 
 def read(path: Path) -> dict[str, Mapping[str, Any]]:

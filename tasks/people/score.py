@@ -206,6 +206,18 @@ def read_reference(path: pathlib.Path) -> dict[str, Any]:
   return data
 
 
+def to_json(data: Mapping[str, Any], depth: int = 0) -> str:
+  """Returns the text of a reference, or of an object that holds some: a metric is one line."""
+  if not any(isinstance(value, Mapping) for value in data.values()):
+    return json.dumps(data, allow_nan=False)
+  lines = []
+  for name, value in data.items():
+    nested = isinstance(value, Mapping)
+    text = to_json(value, depth + 1) if nested else json.dumps(value, allow_nan=False)
+    lines.append(f"{' ' * (depth + 1)}{json.dumps(name)}: {text}")
+  return "{\n" + ",\n".join(lines) + f"\n{' ' * depth}}}" + "\n" * (depth == 0)
+
+
 def _number(value: Any) -> bool:
   return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 

@@ -42,6 +42,8 @@ def test_a_file_is_read_back_and_others_have_what_ships(tmp_path):
   path = tmp_path / "own.json"
   path.write_text(limits.to_json(made))
   assert limits.read(path) == made
+  lines = path.read_text().splitlines()
+  assert sum('"mean":' in line and '"limit":' in line for line in lines) == 3  # a line a metric
   known = limits.lookup(path)
   assert known("touch/easy") == made["touch/easy"]
   assert known("touch/hard") == score.reference("touch/hard") and known("my/own") is None
