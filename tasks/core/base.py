@@ -212,6 +212,14 @@ class Task(engine.Task):
     """Returns what leaves jaws or head of a hand's instrument as an episode begins."""
     return np.zeros(len(self.other if hand else self.extra))
 
+  @property
+  def initial_action(self) -> tuple[float, ...]:
+    """Action that leaves drives, jaws and head as an episode begins  (naction,)."""
+    out: list[float] = []
+    for hand, prefix in enumerate((self.prefix, self.second) if self.second else (self.prefix,)):
+      out += [0.0] * len(self.moved(prefix)) + self.still(hand).tolist()
+    return tuple(out)
+
   def physics(self) -> Physics:
     """Returns the physics of the scene, to make an environment of."""
     model = self.compiled(self.variants[0]).model

@@ -124,6 +124,7 @@ class Needlework(Task):
   """An exercise with a needle; a domain that derives from it has the state `Hands`."""
 
   watch = ("drop", "unintended_contact")
+  right_holds, left_holds = 1.0, 0.0  # as an episode begins
 
   def meet(self, spec: mujoco.MjSpec) -> None:
     """Lets the needle meet what the instruments meet the organ with."""

@@ -112,14 +112,14 @@ class Student:
     """Does what was said."""
     action = self.networks.action(said, self._last)
     found = self.env.step(action)
-    self._last = action * (1 - found[2])[:, None]
+    self._last = torch.where(found[2].bool()[:, None], self.networks.initial_action, action)
     return found
 
   def _begin(self, env: Exercises, seed: int) -> None:
     """Begins episodes in all worlds."""
     self.env = RslRl(env, seed, self.groups)
     self.networks.actor.reset()
-    self._last = torch.zeros(self.env.num_envs, self.env.num_actions, device=self.env.device)
+    self._last = self.networks.initial_action.repeat(self.env.num_envs, 1)
 
   def iterate(self, stop: Callable[[], bool] = lambda: False) -> dict[str, float] | None:
     """Learns from some steps of all worlds; returns `ROW`, or None if it was to stop."""

@@ -62,6 +62,7 @@ class Networks:
     actor: Gaussian about what it would do
     critic: returns what is to come of the discounted rewards
     groups: names of what is observed by group
+    initial_action: what counts as the last action when an episode begins  (naction,)
     lessons: how many it was taught
   """
 
@@ -76,6 +77,7 @@ class Networks:
     device: str,
     taught: bool = True,
     privileged: Sequence[str] = (),
+    initial_action: Sequence[float] = (),
   ):
     """Makes networks that know nothing.
 
@@ -89,6 +91,7 @@ class Networks:
       device: of torch
       taught: whether there will be lessons
       privileged: names of what the critic alone sees
+      initial_action: what counts as the last action when an episode begins; zeros by default
     """
     torch.manual_seed(seed)
     self.groups, self.device, self.lessons = grouped(list(shapes), taught, privileged), device, 0
@@ -97,6 +100,8 @@ class Networks:
     self._components = list(components)
     self._scaled: list[Any] = []  # networks that know how large observations are
     self._changes = [name for name in components if name.endswith(CHANGES)]
+    first = initial_action or [0.0] * len(components)
+    self.initial_action = torch.tensor(first, dtype=torch.float32, device=device)
     self._adds = torch.tensor([float(name.endswith(CHANGES)) for name in components], device=device)
     seen = TensorDict(
       {g: torch.zeros(1, self._width(names)) for g, names in self.groups.items()}, batch_size=[1]
@@ -232,7 +237,7 @@ class Networks:
     parts = dict(zip(self._shapes, flat.split(widths, dim=1), strict=True))
     groups = {g: torch.cat([parts[n] for n in names], dim=1) for g, names in self.groups.items()}
     meant, done = torch.from_numpy(lesson.meant), torch.from_numpy(lesson.done)
-    last = torch.cat([torch.zeros_like(done[:1]), done[:-1]])
+    last = torch.cat([self.initial_action.cpu()[None], done[:-1]])
     says = (meant - self._adds.cpu() * last).clamp(-1.0, 1.0)
     rows = {
       "seen": TensorDict(groups, batch_size=[count]),
@@ -295,8 +300,8 @@ class Networks:
     linear = sorted(int(k.split(".")[1]) for k in weights if k.startswith("mlp.") and "weight" in k)
     about = policy.About(
       task.name, tuple(task.components), self.groups[ACTING], task.control_timestep, POWER,
-      self._changes, dict(task_kwargs), {"palpate": palpate.__version__, **training},
-      pixels=self.pixels,
+      self._changes, self.initial_action.tolist(), dict(task_kwargs),
+      {"palpate": palpate.__version__, **training}, pixels=self.pixels,
     )  # fmt: skip
     layers = self._encoder(self.actor.encoder.layers if self.pixels else [])
     memory: Any = tuple(weights[f"rnn.rnn.{name}_l0"] for name in _GATES)

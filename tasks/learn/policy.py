@@ -48,6 +48,8 @@ class About:
     power: that the size of what the network says is raised to, which makes it exact where actions
       are small
     changes: components that it says as changes of the last action
+    initial_action: what counts as the last action when an episode begins, see
+      `Task.initial_action`; empty for zeros
     task_kwargs: options of the exercise it was trained with
     training: how it was made, for people
     licence: of the weights
@@ -60,6 +62,7 @@ class About:
   control_timestep: float
   power: float = 1.0
   changes: Sequence[str] = ()
+  initial_action: Sequence[float] = ()
   task_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
   training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
   licence: str = "Apache-2.0"
@@ -133,7 +136,8 @@ class Episode:
     """Begins with an empty memory."""
     self.policy, self._count = policy, count
     self._state = np.zeros((*count, policy.memory[1].shape[1])) if policy.memory else None
-    self.last = np.zeros((*count, len(policy.about.components)))
+    first = policy.about.initial_action or np.zeros(len(policy.about.components))
+    self.last = np.tile(np.asarray(first, float), (*count, 1))
     self._adds = np.isin(policy.about.components, policy.about.changes)
 
   def __call__(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -275,15 +279,22 @@ def _check_about(about: About) -> None:
       raise ValueError(f"{name} is {value!r}, expected a list of names")
   for name in ("power", "control_timestep"):
     value = getattr(about, name)
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (number and 0 < value < np.inf):
+    if not (_is_number(value) and 0 < value < np.inf):
       raise ValueError(f"{name} is {value!r}, expected a finite number > 0")
+  first, count = about.initial_action, len(about.components)
+  numbers = isinstance(first, list | tuple) and all(_is_number(v) and abs(v) <= 1 for v in first)
+  if not numbers or len(first) not in (0, count):
+    raise ValueError(f"initial_action is {first!r}, expected {count} numbers in [-1, 1] or none")
   size = about.pixels
   if not isinstance(size, list | tuple) or not all(type(n) is int and n > 0 for n in size):
     raise ValueError(f"pixels is {size!r}, expected height and width")
   for name in ("task_kwargs", "training"):
     if not isinstance(getattr(about, name), dict):
       raise ValueError(f"{name} is {getattr(about, name)!r}, expected options by name")
+
+
+def _is_number(value: Any) -> bool:
+  return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _check_shapes(policy: Policy) -> None:

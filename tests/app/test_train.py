@@ -1,6 +1,7 @@
 """`palpate train`, from an empty folder to a policy that `palpate evaluate` runs."""
 
 import csv
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -169,6 +170,18 @@ def test_networks_take_up_a_policy_and_keep_it_where_observations_vary_otherwise
   for _ in range(3):
     seen = {name: random.randn(*shape) for name, shape in shapes.items()}
     np.testing.assert_allclose(one(seen), other(seen), atol=1e-4)
+
+
+def test_what_is_held_from_the_start_is_no_change_to_learn(monkeypatch):
+  monkeypatch.setattr(networks, "CLONING", 200)
+  names, first = ("pitch", "jaw"), (0.0, 0.5)
+  task = SimpleNamespace(name="any/easy", components=names, control_timestep=0.02)
+  made = networks.Networks({"target": (3,)}, names, 8, (8,), 0.1, 0, "cpu", initial_action=first)
+  seen, held = np.ones((1, 3), np.float32), np.float32([first])
+  made.learn(2 * [Lesson(seen, held, held, np.ones(1, bool), seen[:, 0], "success", False)])
+  learned = made.policy(task, {}, {})
+  assert learned.about.initial_action == list(first)
+  assert learned.begin()({"target": seen[0]})[1] == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_policy_is_judged_by_an_episode_in_each_world():

@@ -134,7 +134,7 @@ class Training:
     self.networks = networks.Networks(
       {key: tuple(spec[key].shape) for key in spec}, self.task.components,
       self.settings.memory, self.settings.hidden, self.settings.spread, args.seed, device, taught,
-      privileged,
+      privileged, self.task.initial_action,
     )  # fmt: skip
     if self.school.rounds:
       self.networks.remember(self.school.lessons)

@@ -69,6 +69,32 @@ def test_a_policy_says_small_actions_and_changes():
   np.testing.assert_allclose(act(SEEN), [0.01, -0.25, 0, 1.0])
 
 
+def test_a_policy_begins_with_what_the_exercise_holds(tmp_path):
+  env = suite.load("needle", "transfer_easy", task_kwargs={"surroundings": "unseen"})
+  first, names = env.task.initial_action, tuple(env.task.components)
+  assert first[names.index("jaw")] == -1.0 and first[names.index("left_psm_jaw")] > 0
+  about = policy.About(
+    "needle/transfer_easy",
+    names,
+    NAMES,
+    0.02,
+    changes=("jaw", "left_psm_jaw"),
+    initial_action=first,
+  )
+  quiet = made(about=about, layers=[(np.zeros((len(names), 4)), np.zeros(len(names)))])
+  path = tmp_path / "policy.safetensors"
+  policy.save(path, quiet)
+  act = policy.load(path).begin()
+  np.testing.assert_array_equal([act(SEEN), act(SEEN)], [first, first])
+  both = policy.load(path).begin(2)({name: np.stack([seen, seen]) for name, seen in SEEN.items()})
+  np.testing.assert_array_equal(both, [first, first])
+  env.task.random.seed(0)
+  env.reset()
+  for _ in range(30):  # longer than a needle may be loose
+    env.step(np.array(first))
+  assert env.task.right_holds and not env.task.left_holds and env.task.outcome is None
+
+
 def test_a_policy_of_something_else_is_refused_by_name(tmp_path):
   path = tmp_path / "policy.safetensors"
   env = suite.load("touch", "easy", task_kwargs={"random": 0})
@@ -113,6 +139,8 @@ def test_a_file_that_is_none_is_refused(tmp_path):
   ("changes", "said"),
   [
     ({"power": float("nan")}, "power is nan, expected a finite number > 0"),
+    ({"initial_action": (0, 0, 0, 2)}, r"initial_action is \[0, 0, 0, 2\], expected 4 numbers in"),
+    ({"initial_action": (0.5,)}, r"initial_action is \[0.5\], expected 4 numbers in \[-1, 1\] or"),
     ({"power": -3.0}, "power is -3.0, expected a finite number > 0"),
     ({"control_timestep": "x"}, "control_timestep is 'x', expected a finite number"),
     ({"components": 5}, "components is 5, expected a list of names"),
