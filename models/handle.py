@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """The handle of an instrument with virtual coupling: where the hand holds it, and what it feels.
 
 The handle is a mocap body with the frame of the tip: its z is along the shaft, back to the hand.

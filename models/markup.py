@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """The MJCF of organs and of the catalogue's scenes."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Measures a scene: `python -m palpate.models.measure [NAME ...] [--nodes N ...]`.
 
 The first instrument, a probe of 2.5 mm radius, is pressed along the surface's normal at the place

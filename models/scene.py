@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Models to load: an organ alone, or a scene of organ, instruments, light and laparoscope.
 
 The files under `models/<organ>/` are what this module writes at the default resolution; other

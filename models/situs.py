@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """One abdomen: any of its organs soft, the others scenery, lit by an endoscope.
 
 `furnish` draws scenery, which then has no contacts and no dofs; `obstruct` lets instruments meet

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Instruments on a trocar: attaching them, and where the tip is.
 
 The instrument's frame has the trocar point at its origin and the shaft along -z when every joint

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Writing scenes: adds an organ to an `mujoco.MjSpec`, as a <flexcomp> does to MJCF."""
 
 from __future__ import annotations

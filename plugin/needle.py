@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Surgical needles: `add_needle` adds a curved one to an `mujoco.MjSpec`."""
 
 from __future__ import annotations

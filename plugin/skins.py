@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Smooth organs in pictures: gives an organ of an `mujoco.MjSpec` a skin."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Writing scenes: gives an organ of an `mujoco.MjSpec` room for cuts."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Surgical threads: `add_thread` adds one to an `mujoco.MjSpec`, `Thread` is the handle on it."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Writing scenes: gives an organ of an `mujoco.MjSpec` windows, so that nobody does it by hand."""
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
 """Small kernels of batches on a device: resets, counts, and states in the user's layout."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 from typing import Any
 
 import warp as wp

@@ -5,7 +5,6 @@ linear in the triangles' factors on the modulus they were compiled with, so that
 are products with sparse matrices.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import math
 from typing import TYPE_CHECKING

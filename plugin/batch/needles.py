@@ -1,6 +1,5 @@
 """What needles do in the worlds of a batch."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 from collections.abc import Sequence
 from typing import NamedTuple

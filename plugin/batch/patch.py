@@ -1,6 +1,5 @@
 """An organ in all worlds of a batch: its patch of slots, and the kernels over them."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 from typing import TYPE_CHECKING
 

@@ -5,7 +5,6 @@ constraints and its solver the thread takes its step (`coupling/world_rods.h`), 
 organ through which it goes.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import functools
 from typing import TYPE_CHECKING, Any

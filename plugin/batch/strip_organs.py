@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """What mujoco_warp gets of a scene: all but the organs, and slots in their place.
 
 The slots of an organ are the vertices of one flex whose triangles are all triples of slots, since

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """A camera of a batch: pictures of all worlds, or of some."""
 
 from __future__ import annotations

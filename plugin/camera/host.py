@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """What cameras look at: worlds with bodies and organs. A batch is one, an mjData another."""
 
 from __future__ import annotations

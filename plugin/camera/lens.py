@@ -4,7 +4,6 @@ The order is that of the light: distortion and motion, smoke, blood on the lens,
 What is known of a pixel (depth, labels, points) goes through the distortion too, but is not mixed.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """What a camera sees of a compiled scene: things, and the surfaces that they have.
 
 A thing is a geom, a site, a skin or a flex, as MuJoCo's renderer draws it: those of groups 0 to 2.

@@ -6,7 +6,6 @@ does not see, and there are no shadows. The light is OpenGL's fixed pipeline as 
 Gouraud's of colours).
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
 from palpate.engine.cutting.walls import LIP
 from palpate.tissue.types import struct

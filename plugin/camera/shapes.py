@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Triangles of what MuJoCo draws: geoms and sites of every shape, as its renderer divides them."""
 
 from __future__ import annotations

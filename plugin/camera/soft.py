@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Organs as a camera sees them: surfaces whose vertices follow the organ's linearly.
 
 A skin is the smooth surface through the organ's vertices. Without one, or once cuts have changed

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Textures of a model in one array, each with pictures half as large, a quarter, ... of it."""
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
 """What the kernels of cameras read and write."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
 from palpate.tissue.types import Array, floats, ints, struct
 

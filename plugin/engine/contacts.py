@@ -4,7 +4,6 @@ MuJoCo 3.17 weighs the corners of a touched triangle by inverse distance: forces
 flicker where a tool presses. MuJoCo 4.0 has it right. Both part what slides.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 
 import functools

@@ -8,7 +8,6 @@ the forces that act in it, and gains no more energy than they give. The inertia 
 then is a guess of what a tool meets, and follows the organ's answers.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 from collections.abc import Callable, Mapping
 from types import MappingProxyType

@@ -5,7 +5,6 @@ views of them. Short ones (`Numbers`) have a name for each number. Native code h
 fields and the offsets of the short ones as constants, HEAD_MODE for `HEAD.mode`.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import math
 from collections.abc import Mapping

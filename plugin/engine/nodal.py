@@ -1,6 +1,5 @@
 """Nodal coupling: an organ whose moving nodes are MuJoCo's degrees of freedom."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 from typing import TYPE_CHECKING
 

@@ -4,7 +4,6 @@ MuJoCo looks for contacts once a step, on a surface without thickness: what pass
 radius in a step, or is pressed through, comes out inside.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 
 from typing import TYPE_CHECKING

@@ -1,6 +1,5 @@
 """What an organ is bonded to, by its declaration or from Python; see `cohesive_bonds`."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 from typing import Any
 

@@ -5,7 +5,6 @@ rows of worlds, in mujoco_warp's (`palpate.batch.host`). A force is written once
 arrays have worlds in front: a kernel begins by moving what worlds have of their own to its world.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import abc
 import contextlib

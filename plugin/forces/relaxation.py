@@ -1,6 +1,5 @@
 """Stress relaxation of an organ: what elastic forces leave behind; see `forces/relaxation.h`."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp

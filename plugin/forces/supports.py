@@ -1,6 +1,5 @@
 """Supports: geoms and organs that bear an organ by springs; see `forces/supports.h`."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
 import functools

@@ -1,6 +1,5 @@
 """Tissue that tears where it is stretched too far, across the stretch; see `Organ.cut`."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import contextlib
 

@@ -3,7 +3,6 @@
 `shape` makes the arrays of all of them so, and `refill` writes those that a cut has changed.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 from collections.abc import Callable, Mapping
 from typing import Any

@@ -7,7 +7,6 @@ bending), ntetslice of tetrahedra (0 but for solids); nslot rows of stiffness bl
 axis; `core/simd.h` says how they are read.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 import dataclasses
 import enum
 from typing import Any
@@ -63,6 +62,9 @@ DIMS: dict[str, dict[str, tuple]] = {}  # struct and field -> its shape
 def struct(cls) -> Any:
   """Returns a Warp struct whose arrays have the shapes of the annotations."""
   kinds = cls.__annotations__
+  if any(isinstance(kind, str) for kind in kinds.values()):
+    text = "annotations are text, expected no `from __future__ import annotations` in the module"
+    raise TypeError(f"{cls.__module__}.{cls.__qualname__}: {text}")
   arrays = {name: kind for name, kind in kinds.items() if isinstance(kind, Array)}
   DIMS[cls.__name__] = {name: kind.dims for name, kind in arrays.items()}
   cls.__annotations__ = kinds | {

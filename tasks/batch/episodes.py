@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Episodes are drawn on the host, by the exercise itself in a scene that rests."""
 
 from __future__ import annotations

@@ -4,7 +4,6 @@ Sizes are named: nworld worlds, nvert nodes, nelem triangles, naction components
 axes of the instrument.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
 from palpate.batch.needles import HOLES
 from palpate.tasks.core.physics import COARSE, NEAR

@@ -1,6 +1,5 @@
 """What every vectorised exercise does in its worlds, a thread a world."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
 from palpate.tasks.core import base, jaws, safety
 from palpate.tasks.core.physics import NEAR

@@ -1,6 +1,5 @@
 """Marks of exercises in the pictures of many worlds: sites, and films of bonds."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 import functools
 from typing import Any
 

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """What the laparoscopes of worlds see: pictures as the single environment has them."""
 
 from __future__ import annotations

@@ -4,7 +4,6 @@ Not those that need the whole signal at once, filtered or as a spectrum, nor are
 is not in `NAMES` a recording of the single environment has.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import enum
 

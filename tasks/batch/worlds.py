@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """The worlds of a vectorised exercise: arrays on a device, stepped and begun anew there."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """What every exercise shares: `Physics` answers questions, `Task` decides.
 
 Action, every component in [-1, 1]; each control step (0.02 s) moves the targets of the instrument's

@@ -5,8 +5,6 @@ same to the bit with the classes below: the interface is dm_control's (Tassa et 
 arXiv:2006.12983), and the environment is a `dm_env.Environment` too.
 """
 
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import contextlib

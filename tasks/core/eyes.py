@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Pictures of a single environment, drawn as those of batches are, without OpenGL."""
 
 from collections.abc import Mapping, Sequence

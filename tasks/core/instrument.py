@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """An instrument on a trocar: where it is, what moves it and what it feels."""
 
 import math

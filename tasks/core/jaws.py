@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """What a grasper has between its jaws, from the contacts of their inner faces."""
 
 import mujoco as mj

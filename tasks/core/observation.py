@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """What is observed: groups and pictures to choose from.
 
 `sensors` is what a robot has. `state` is privileged: what only a simulation knows of the organ, the

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """The physics of an exercise: one organ, an instrument or two, and what one asks of them."""
 
 import functools

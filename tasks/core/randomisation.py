@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Domain randomisation: quantities drawn from ranges at the start of every episode.
 
     tasks.load("touch", "easy", task_kwargs={"randomise": {"stiffness": (0.5, 2.0)}})

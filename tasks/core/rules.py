@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """The words that the rules of exercises are written in.
 
 A rule is a plain function of the world `s` and of the exercise's state in it, `o`, which it returns

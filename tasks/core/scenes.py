@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Scenes of the exercises: one organ, one instrument on a trocar, a laparoscope, target markers.
 
 World: z is up, away from the table, and the patient lies on the back: the organ's frame (x to the

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """A compiled scene with its organ at rest: what every episode in it begins from."""
 
 import dataclasses

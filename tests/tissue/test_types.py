@@ -37,3 +37,9 @@ def test_every_field_of_a_struct_says_what_it_is_on_its_line(name):
   for field in getattr(types, name).vars:
     line = re.search(rf"(?:^  #.*\n)*^  {field}: .*$", text, re.MULTILINE)[0]
     assert re.search(r"# \w", line) or re.search(r": (vector|scalar)  # ", line), field
+
+
+def test_a_struct_whose_annotations_are_text_is_refused():
+  cls = type("Late", (), {"__annotations__": {"size": "int"}})
+  with pytest.raises(TypeError, match="Late: annotations are text"):
+    types.struct(cls)

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """The loop: its thread owns the simulation, everything else is elsewhere."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """Free practice: an organ, one instrument or two, no task; scheme and device change on the way."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """The laparoscope of a scene whose camera stands: somebody holds it, or it follows the instrument.
 
 It is about a trocar behind the view that the scene begins with. A hand moves the lens across the

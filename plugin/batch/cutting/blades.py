@@ -1,6 +1,5 @@
 """What a batch tells of the geoms that cut an organ: arrays on the device, and a sensor's force."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import warp as wp
 from palpate.engine.layout import BLADE

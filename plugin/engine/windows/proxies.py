@@ -1,6 +1,5 @@
 """Windows, the slots' side: what MuJoCo and a windowed organ share, on the CPU."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any

@@ -6,7 +6,6 @@ numbers and none is added, so that what is stored by triangle stays, and so does
 arrays need.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
 from typing import Any, ClassVar

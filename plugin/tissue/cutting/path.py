@@ -1,6 +1,5 @@
 """Places of a surface that are nearest to points, and paths on it."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 from typing import NamedTuple
 

@@ -1,6 +1,5 @@
 """A mesh where native code reads and writes it."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
 
