@@ -13,7 +13,7 @@ from palpate.engine.model import inertia, mjstruct
 from palpate.engine.windows import proxies
 from palpate.tissue import step
 from palpate.tissue.cutting.facets import World
-from palpate.tissue.types import Array, Tissue, doubles, fill, floats, ints, struct, vector
+from palpate.tissue.types import Array, Tissue, doubles, fill, floats, ints, struct, vector, zeros
 
 if TYPE_CHECKING:
   from palpate.engine.model.declare import Declaration
@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 _BLOCK = 128  # threads, whole warps
 _ENDLESS = 1e300  # square of a distance beyond all others [m^2]
 _LONGER = 1.5  # times which an edge may be that a cut has moved
+# What worlds have of their own, beside what is not zero.
+_OWN = (
+  *("lump", "heavier", "calm", "stirred", "force", "last", "before", "count", "candidate"),
+  *("distance", "chosen", "found", "missed"),
+)
 # Steps of the scale of Young's modulus for which the effective inertia is known.
 GRADES = 2.0 ** np.arange(-4, 5)
 
@@ -302,28 +307,14 @@ def _tools(tools: np.ndarray, lines: list, model, reach: float) -> np.ndarray:
 
 def variables(nworld: int, nslot: int, nslice: int) -> dict:
   """Returns the fields of `Patch` that worlds have of their own, at rest."""
-  nnode = 8 * nslice
-  shape = (nworld, nslice, 3, 8)
-  return dict(
+  sizes = {"nworld": nworld, "nslot": nslot, "nslice": nslice, "nnode": 8 * nslice, "nlump": 0}
+  return zeros(_OWN, sizes, (Patch,)) | dict(
     nslot=nslot,
     grade=np.full(nworld, np.log2(1.0 / GRADES[0])),
     mass_scale=np.ones(nworld),
-    lump=np.zeros((0, nnode)),
-    heavier=np.zeros(nworld),
-    calm=np.zeros(nworld),
-    stirred=np.zeros(nworld),
-    force=np.zeros((nworld, nnode, 3)),
-    last=np.zeros(shape),
-    before=np.zeros(shape),
-    count=np.zeros(nworld),
-    candidate=np.zeros((nworld, nnode)),
-    distance=np.zeros((nworld, nnode)),
-    chosen=np.zeros((nworld, nnode)),
     slot_node=np.full((nworld, nslot), -1),
-    node_slot=np.full((nworld, nnode), -1),
-    found=np.zeros((nworld, nslot, 3)),
-    missed=np.zeros(nworld),
-  )  # fmt: skip
+    node_slot=np.full((nworld, sizes["nnode"]), -1),
+  )
 
 
 def make(values: dict, body):

@@ -16,7 +16,7 @@ from palpate.tissue import device as devices
 from palpate.tissue import rod
 from palpate.tissue.config import Config
 from palpate.tissue.kernels import kernel
-from palpate.tissue.types import Array, Views, doubles, fill, ints, struct
+from palpate.tissue.types import Array, Views, doubles, fill, ints, struct, zeros
 
 from . import contacts, coupling, graphs, layout
 from .coupling import Mujoco
@@ -34,6 +34,12 @@ _SLOW = 1e-6  # velocity below which friction within a thread is viscous [m/s]
 _MUJOCOS = (
   *("jacobian", "flex_margin", "qvel", "qacc", "qacc_warmstart", "qfrc_smooth"),
   *("M_rowadr", "M_rownnz", "M_colind"),
+)
+_WRITTEN = (
+  *("start", "vel", "external", "aim", "place", "turn", "force", "move", "trial", "gradient"),
+  *("matrix", "inverse", "rank", "near", "ranked", "first", "start_of_row", "below", "status"),
+  *("count", "smooth", "reach", "listed", "pair", "pressure", "touch"),
+  *("row_kind", "row_node", "row_value"),
 )
 _HUGE = 1e6  # more than any twist [rad]
 
@@ -236,29 +242,8 @@ def settings(organ: Declaration, friction: float) -> dict:
 
 def scratch(n: int) -> dict[str, np.ndarray]:
   """Returns the fields of `Rod` that a step of n nodes writes."""
-  nodes = ("start", "vel", "external", "aim", "place", "listed")
-  unknowns = ("force", "move", "trial", "gradient", "first", "start_of_row", "below")
-  pairs, rows, entries = _MOST_PAIRS * n, _MOST_ROWS * n, 2 * n * (4 * n + 1)
-  return dict(
-    **{name: np.zeros((n, 3)) for name in nodes},
-    **{name: np.zeros(4 * n) for name in unknowns},
-    turn=np.zeros(n),
-    rank=np.zeros(n),
-    ranked=np.zeros((4 * n, 4)),
-    near=np.zeros(((n + 1), -(-n // 32))),
-    matrix=np.zeros(entries),
-    inverse=np.zeros(entries),
-    status=np.zeros(1),
-    count=np.zeros(3),
-    smooth=np.zeros(1),
-    reach=np.zeros(1),
-    pair=np.zeros((pairs, 2)),
-    pressure=np.zeros(pairs),
-    touch=np.zeros((pairs, 5)),
-    row_kind=np.zeros(rows),
-    row_node=np.zeros(rows),
-    row_value=np.zeros((rows, 9)),
-  )
+  sizes = {"nnode": n, "nunknown": 4 * n, "npair": _MOST_PAIRS * n, "nrow": _MOST_ROWS * n}
+  return zeros(_WRITTEN, sizes | {"nentry": 2 * n * (4 * n + 1), "nword_node": -(-n // 32)}, (Rod,))
 
 
 def state_of(state: np.ndarray, n: int) -> Views:

@@ -380,27 +380,29 @@ def fill(
   return out
 
 
-def zeros(names: tuple[str, ...], sizes: dict[str, int]) -> dict[str, np.ndarray]:
-  """Returns arrays of `Shape` and `Tissue` of zeros, of the sizes that their shapes name."""
-  found = {name: dims for name, dims in _dims().items() if name in names}
+def zeros(
+  names: tuple[str, ...], sizes: dict[str, int], kinds: tuple = (Shape, Tissue)
+) -> dict[str, np.ndarray]:
+  """Returns arrays of structs of zeros, of the sizes that their shapes name."""
   return {
-    name: np.zeros([_extent(dim, sizes) for dim in dims], _dtype(name))
-    for name, dims in found.items()
+    name: np.zeros([_extent(dim, sizes) for dim in dims], _dtype(kind, name))
+    for kind in kinds
+    for name, dims in DIMS[kind.key].items()
+    if name in names
   }
 
 
 def empty(sizes: tuple[str, ...]) -> dict[str, np.ndarray]:
   """Returns the arrays of `Shape` and `Tissue` whose first axis is one of `sizes`, empty."""
-  found = {name: dims for name, dims in _dims().items() if dims[0] in sizes}
-  return {name: np.zeros((0, *dims[1:]), _dtype(name)) for name, dims in found.items()}
+  return {
+    name: np.zeros((0, *dims[1:]), _dtype(kind, name))
+    for kind in (Shape, Tissue)
+    for name, dims in DIMS[kind.key].items()
+    if dims[0] in sizes
+  }
 
 
-def _dims() -> dict[str, tuple]:
-  return {name: dims for kind in (Shape, Tissue) for name, dims in DIMS[kind.key].items()}
-
-
-def _dtype(name: str):
-  kind = Shape if name in Shape.vars else Tissue
+def _dtype(kind: Any, name: str):
   return wp.dtype_to_numpy(kind.vars[name].type.dtype)
 
 
