@@ -14,8 +14,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import mujoco
+from palpate.tissue.reading import count_of
 
-from .base import Batch, Contacts, Tissue, count_of
+from .base import Batch, Contacts, Tissue
 from .multi_device import Several
 from .threads import Threads
 from .worlds import Worlds
@@ -52,7 +53,7 @@ def make(
     ValueError: an argument is not allowed, the machine has no such device or no room for so many
       worlds, or the scene has what a batch cannot do; the message names it.
   """
-  nworld = count_of(nworld)
+  nworld = count_of("nworld", nworld)
   if not isinstance(scene, mujoco.MjSpec | mujoco.MjModel):
     kind = type(scene).__name__
     raise ValueError(f"scene is a {kind}, expected a mujoco.MjSpec or mujoco.MjModel")

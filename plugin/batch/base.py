@@ -14,6 +14,7 @@ from palpate.engine.model.declare import Declaration
 from palpate.engine.workspace import Workspace
 from palpate.organ import instances
 from palpate.tissue.geometry.mesh import Mesh
+from palpate.tissue.reading import count_of
 
 from .cutting.fracture import Parting
 from .needles import Needles
@@ -121,9 +122,7 @@ class Batch(abc.ABC):
     Returns:
       (nworld, steps, nsensordata), which keeps its place
     """
-    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
-      raise ValueError(f"steps is {steps!r}, expected a whole number >= 1")
-    return self._watch(self._make(int(steps), self.model.nsensordata))
+    return self._watch(self._make(count_of("steps", steps), self.model.nsensordata))
 
   def feel(self, sensor: str, organ: str):
     """Adds the force of what cuts an organ to a sensor of force, in each step from now on.
@@ -233,10 +232,8 @@ class Batch(abc.ABC):
 
     A world that ends with numbers that are not finite is reset and counted in `failures`.
     """
-    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
-      raise ValueError(f"n is {n!r}, expected a whole number >= 1")
-    self._fresh = False
-    self._step(int(n))
+    n, self._fresh = count_of("n", n), False
+    self._step(n)
 
   @abc.abstractmethod
   def _step(self, n: int):
@@ -526,13 +523,6 @@ class Thread(abc.ABC):
   @abc.abstractmethod
   def tension(self) -> wp.array:
     """Tension of each edge [N], (nworld, nnode - 1); negative where it is compressed."""
-
-
-def count_of(nworld: int) -> int:
-  """Returns a number of worlds that is one."""
-  if isinstance(nworld, bool) or not isinstance(nworld, int | np.integer) or nworld < 1:
-    raise ValueError(f"nworld is {nworld!r}, expected a whole number >= 1")
-  return int(nworld)
 
 
 def on_device(values, dtype, device) -> wp.array:

@@ -24,6 +24,7 @@ from palpate.tissue.cutting.topology import Report
 from palpate.tissue.device import free_memory, refuse_crowd
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
+from palpate.tissue.reading import count_of
 
 from . import base
 from .base import Batch, Tissue, spread
@@ -52,7 +53,7 @@ class Threads(Batch):
 
   def __init__(self, scene, nworld: int, nthread: int | None = None):
     model = scene.compile() if isinstance(scene, mujoco.MjSpec) else scene
-    nthread = _threads(nthread)
+    nthread = os.cpu_count() or 1 if nthread is None else count_of("nthread", nthread)
     super().__init__(model, nworld, "cpu")
     # Windows, and the inertia that follows a tissue, are in the model: a world needs its own.
     self.models = [copy.copy(model)]
@@ -335,14 +336,6 @@ class _Thread(base.Thread):
   def tension(self) -> wp.array:
     """Tension of each edge [N], (nworld, nnode - 1)."""
     return wp.array([each.tension for each in self.handles], dtype=float, device="cpu")
-
-
-def _threads(nthread: int | None) -> int:
-  if nthread is None:
-    return os.cpu_count() or 1
-  if isinstance(nthread, bool) or not isinstance(nthread, int) or nthread < 1:
-    raise ValueError(f"nthread is {nthread!r}, expected a whole number >= 1")
-  return nthread
 
 
 def _copy_state(model, data, other_model, other):

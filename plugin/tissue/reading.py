@@ -7,6 +7,8 @@ import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+import numpy as np
+
 AUTO = -1  # spare vertices: as many as there are
 NOTHING = "none"  # as bonds: they are made while running
 
@@ -16,6 +18,13 @@ def choices(value: str, known: Iterable[str]) -> str:
   known = [*known]
   near = difflib.get_close_matches(str(value), known, 1)
   return f"expected one of {', '.join(known)}" + (f"; did you mean {near[0]!r}?" if near else "")
+
+
+def count_of(name: str, value: Any) -> int:
+  """Returns a number of things; ValueError says of which it is none."""
+  if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+    raise ValueError(f"{name} is {value!r}, expected a whole number >= 1")
+  return int(value)
 
 
 def plain(word: str) -> str:

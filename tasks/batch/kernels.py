@@ -36,9 +36,15 @@ def put(values: wp.array(dtype=float, ndim=2), w: int, v: wp.vec3):
 
 
 @wp.func
+def entry(values: wp.array(dtype=float, ndim=3), w: int, k: int):
+  """Returns the vector in entry k of a row."""
+  return wp.vec3(values[w, k, 0], values[w, k, 1], values[w, k, 2])
+
+
+@wp.func
 def node(s: Common, w: int, k: int):
   """Returns the position of a node [m]."""
-  return wp.vec3(s.xpos[w, k, 0], s.xpos[w, k, 1], s.xpos[w, k, 2])
+  return entry(s.xpos, w, k)
 
 
 @wp.func
@@ -234,13 +240,6 @@ def place(s: Common, w: int):
 def error(s: Common, w: int):
   """Counts a miss, a drop or a contact that was not meant."""
   s.errors[w] = s.errors[w] + 1
-
-
-@wp.func
-def reach(s: Common, w: int, distance: float):
-  """Counts a target that was reached, at a distance from it [m]."""
-  s.targets[w] = s.targets[w] + 1
-  s.missed_by[w] = s.missed_by[w] + distance
 
 
 @wp.func

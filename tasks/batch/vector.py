@@ -25,6 +25,7 @@ from gymnasium.vector.utils import batch_space
 from palpate.batch.base import on_device
 from palpate.tasks.core import observation, randomisation
 from palpate.tasks.gym import Exercise
+from palpate.tissue.reading import count_of
 
 from . import tally
 from .fields import INFO, OBSERVED, OUTCOMES
@@ -90,9 +91,7 @@ class Exercises(VectorEnv):
       raise ValueError(f"render_mode is {render_mode!r}, expected None or rgb_array")
     if output not in OUTPUTS:
       raise ValueError(f"output is {output!r}, expected one of {', '.join(OUTPUTS)}")
-    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-      raise ValueError(f"num_envs is {num_envs!r}, expected a whole number >= 1")
-    self.num_envs, self.output = int(num_envs), output
+    self.num_envs, self.output = count_of("num_envs", num_envs), output
     _refuse(task, kwargs)
     chosen = observation.choose(kwargs.get("observations"), kwargs.get("pixels"))
     seen = render_mode or chosen.pictures

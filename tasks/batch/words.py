@@ -1,4 +1,7 @@
-"""The words of `tasks.core.rules` for many worlds, and what compiles rules that use them."""
+"""The words of `tasks.core.rules` for many worlds, and what compiles rules that use them.
+
+`rules` says what each of them returns.
+"""
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # Vectors of Warp's are not known to type checkers:
@@ -38,85 +41,71 @@ def word(function: Any) -> Any:
 
 @word
 def tip(s: Common):
-  """See `rules`."""
   return kernels.vector(s.tip_pos, s.world)
 
 
 @word
 def point(s: Common, triangle: int):
-  """See `rules`."""
   return kernels.point(s, s.world, triangle)
 
 
 @word
 def corner(s: Common, triangle: int, k: int):
-  """See `rules`."""
   return kernels.node(s, s.world, s.elem[triangle, k])
 
 
 @word
 def normal(s: Common, triangle: int):
-  """See `rules`."""
   return kernels.normal(s, s.world, triangle)
 
 
 @word
 def peak(s: Common):
-  """See `rules`."""
   return s.tissue_peak[s.world]
 
 
 @word
 def tissue_force(s: Common):
-  """See `rules`."""
   return kernels.vector(s.tissue_force, s.world)
 
 
 @word
 def force(s: Common):
-  """See `rules`."""
   return wp.length(tissue_force(s))
 
 
 @word
 def last_component(s: Common, o: Any):
-  """See `rules`."""
   return s.action[s.world, s.action.shape[1] - 1]
 
 
 @word
 def other_tip(s: Common):
-  """See `rules`."""
   return kernels.vector(s.other_tip_pos, s.world)
 
 
 @word
 def other_point(s: Common, place: wp.vec3):
-  """See `rules`."""
   return other_tip(s) + wp.quat_rotate(_turn(s.other_tip_quat, s.world), place)
 
 
 @word
 def other_force(s: Common):
-  """See `rules`."""
   return wp.length(kernels.vector(s.other_tissue_force, s.world))
 
 
 @word
 def pinch(s: Common):
-  """See `rules`."""
   return wp.min(s.gripper[s.world, 2], s.gripper[s.world, 3])
 
 
 @word
 def other_pinch(s: Common):
-  """See `rules`."""
   return wp.min(s.other_gripper[s.world, 2], s.other_gripper[s.world, 3])
 
 
 @word
 def needle_place(s: Common, place: wp.vec3):
-  """See `rules`."""
   w, k = s.world, s.needle
   turn = wp.quat(s.qpos[w, k + 4], s.qpos[w, k + 5], s.qpos[w, k + 6], s.qpos[w, k + 3])
   return wp.vec3(s.qpos[w, k], s.qpos[w, k + 1], s.qpos[w, k + 2]) + wp.quat_rotate(turn, place)
@@ -124,23 +113,17 @@ def needle_place(s: Common, place: wp.vec3):
 
 @word
 def scraped(s: Common):
-  """See `rules`."""
   w, k = s.world, s.scrape
-  force = wp.vec3(s.sensordata[w, k], s.sensordata[w, k + 1], s.sensordata[w, k + 2])
-  return wp.length(force)
+  return wp.length(wp.vec3(s.sensordata[w, k], s.sensordata[w, k + 1], s.sensordata[w, k + 2]))
 
 
 @word
 def pierced(s: Common):
-  """See `rules`."""
-  w = s.world
-  pull = wp.vec3(s.needle_force[w, 0, 0], s.needle_force[w, 0, 1], s.needle_force[w, 0, 2])
-  return s.hole_count[w, 0], wp.length(pull)
+  return s.hole_count[s.world, 0], wp.length(kernels.entry(s.needle_force, s.world, 0))
 
 
 @word
 def pinhole(s: Common, k: int):
-  """See `rules`."""
   w = s.world
   rest = wp.vec3(s.hole_rest[w, 0, k, 0], s.hole_rest[w, 0, k, 1], s.hole_rest[w, 0, k, 2])
   return rest, s.hole_along[w, 0, k]
@@ -148,13 +131,11 @@ def pinhole(s: Common, k: int):
 
 @word
 def torn_at(s: Common, k: int):
-  """See `rules`."""
   return s.hole_torn[s.world, 0, k]
 
 
 @word
 def taut(s: Common):
-  """See `rules`."""
   most = s.tension[s.world, 0]
   for k in range(1, s.tension.shape[1]):
     most = wp.max(most, s.tension[s.world, k])
@@ -163,13 +144,11 @@ def taut(s: Common):
 
 @word
 def lens(s: Common):
-  """See `rules`."""
   return tip(s)
 
 
 @word
 def picture(s: Common):
-  """See `rules`."""
   half = -0.5 * s.optics
   turn = _turn(s.tip_quat, s.world) * wp.quat(wp.sin(half), 0.0, 0.0, wp.cos(half))
   half = 0.5 * s.camera_head[s.world, 0]
@@ -179,13 +158,11 @@ def picture(s: Common):
 
 @word
 def guided_tip(s: Common):
-  """See `rules`."""
   return kernels.vector(s.guided_tip_pos, s.world)
 
 
 @word
 def guide(s: Common, joints: wp.vec3):
-  """See `rules`."""
   s.ctrl[s.world, s.guided_drive[0]] = joints[0]
   s.ctrl[s.world, s.guided_drive[1]] = joints[1]
   s.ctrl[s.world, s.guided_drive[3]] = joints[2]
@@ -193,35 +170,27 @@ def guide(s: Common, joints: wp.vec3):
 
 @word
 def bonds(s: Common):
-  """See `rules`."""
   return s.bond_vert.shape[0]
 
 
 @word
 def bond(s: Common, k: int):
-  """See `rules`."""
   return kernels.node(s, s.world, s.bond_vert[k])
 
 
 @word
 def strand_distance(s: Common, k: int, start: wp.vec3, end: wp.vec3):
-  """See `rules`."""
-  strand = wp.vec3(
-    s.bond_stretch[s.world, k, 0], s.bond_stretch[s.world, k, 1], s.bond_stretch[s.world, k, 2]
-  )
-  organ = bond(s, k)
+  strand, organ = kernels.entry(s.bond_stretch, s.world, k), bond(s, k)
   return wp.closest_point_edge_edge(start, end, organ - strand, organ, _POINT)[2]
 
 
 @word
 def is_free(s: Common, k: int):
-  """See `rules`."""
   return s.bond_damage[s.world, k] >= 1.0
 
 
 @word
 def share_freed(s: Common):
-  """See `rules`."""
   free = wp.float64(0.0)
   for k in range(bonds(s)):
     if is_free(s, k):
@@ -231,38 +200,30 @@ def share_freed(s: Common):
 
 @word
 def traction(s: Common):
-  """See `rules`."""
   sum = wp.vec3()
   for k in range(bonds(s)):
-    sum += wp.vec3(
-      s.bond_force[s.world, k, 0], s.bond_force[s.world, k, 1], s.bond_force[s.world, k, 2]
-    )
+    sum += kernels.entry(s.bond_force, s.world, k)
   return wp.length(sum)
 
 
 @word
 def weaken(s: Common, k: int, amount: float):
-  """See `rules`."""
   s.bond_loss[s.world, k] = s.bond_loss[s.world, k] + amount
 
 
 @word
 def cutter(s: Common):
-  """See `rules`."""
-  w = s.world
-  seat = wp.vec3(s.cutter_seat[w, 0, 0], s.cutter_seat[w, 0, 1], s.cutter_seat[w, 0, 2])
-  return s.cutter_inside[w, 0] > 0.0, s.cutter_length[w, 0], seat
+  seat = kernels.entry(s.cutter_seat, s.world, 0)
+  return s.cutter_inside[s.world, 0] > 0.0, s.cutter_length[s.world, 0], seat
 
 
 @word
 def ended(s: Common, o: Any):
-  """See `rules`."""
   return s.outcome[s.world] != 0
 
 
 @word
 def pieces(s: Common):
-  """See `rules`."""
   return s.piece_count[s.world]
 
 
@@ -273,13 +234,11 @@ def tear(s: Common, o: Any, value: float):
 
 @word
 def miss(s: Common, o: Any, value: float):
-  """See `rules`."""
-  s.errors[s.world] = s.errors[s.world] + 1
+  kernels.error(s, s.world)
 
 
 @word
 def reach(s: Common, o: Any, value: float):
-  """See `rules`."""
   s.targets[s.world] = s.targets[s.world] + 1
   s.missed_by[s.world] = s.missed_by[s.world] + value
 
@@ -292,52 +251,44 @@ def _turn(quat: wp.array2d[float], w: int):
 
 @word
 def from_tip(s: Common, place: wp.vec3):
-  """See `rules`."""
   return wp.quat_rotate_inv(_turn(s.tip_quat, s.world), place - tip(s))
 
 
 @word
 def closing(s: Common):
-  """See `rules`."""
   opening, target = s.gripper[s.world, 0], s.gripper[s.world, 1]
   return target < wp.min(opening - _CLOSING, _GRIPPING)
 
 
 @word
 def holds(s: Common):
-  """See `rules`."""
   both = wp.min(s.inner[s.world, 0], s.inner[s.world, 1])
   return both > _FORCE and s.gripper[s.world, 0] > _FOLD
 
 
 @word
 def opening(s: Common):
-  """See `rules`."""
   return s.gripper[s.world, 0]
 
 
 @word
 def grip(s: Common, o: Any, value: float):
-  """See `rules`."""
   reach(s, o, value)
   s.grasps[s.world] = s.grasps[s.world] + 1
 
 
 @word
 def slipped(s: Common, o: Any):
-  """See `rules`."""
   s.slips[s.world] = s.slips[s.world] + 1
 
 
 @word
 def drop(s: Common, o: Any):
-  """See `rules`."""
-  s.errors[s.world] = s.errors[s.world] + 1
+  kernels.error(s, s.world)
 
 
 @word
 def visible(s: Common, o: Any):
-  """See `rules`."""
   seen = wp.float32(0.0)
   for k in range(s.behind.shape[1]):
     if not s.behind[s.world, k]:

@@ -420,7 +420,7 @@ class Task(engine.Task):
     self.progress = self.advance(physics)
     tip, shaft, around = physics.peak_tissue, physics.peak_shaft, physics.peak_surroundings
     beside, before = {"shaft": shaft, "surroundings": around}, self.cost
-    self.cost = safety.cost(tip, shaft, around, self.force_limit, self.damage)
+    self.cost = safety.Cost(*safety.parts(tip, shaft, around, self.force_limit, self.damage))
     for where, force in beside.items():
       if getattr(self.cost, where) and not getattr(before, where):
         self.event(physics, "unintended_contact", force, label=where)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from dm_env import specs
+from palpate.tissue.reading import count_of
 
 from . import engine, observation
 
@@ -40,9 +41,8 @@ class Environment(engine.Environment):
     for name, value in (("time_limit", time_limit), ("control_timestep", control_timestep)):
       if value is not None and not (isinstance(value, int | float) and value > 0):
         raise ValueError(f"{task.name}: {name} is {value!r}, expected a number > 0 [s]")
-    whole = isinstance(n_sub_steps, int | np.integer) and not isinstance(n_sub_steps, bool)
-    if n_sub_steps is not None and not (whole and n_sub_steps >= 1):
-      raise ValueError(f"{task.name}: n_sub_steps is {n_sub_steps!r}, expected a whole number >= 1")
+    if n_sub_steps is not None:
+      n_sub_steps = count_of(f"{task.name}: n_sub_steps", n_sub_steps)
     super().__init__(physics, task, time_limit, control_timestep, n_sub_steps, **kwargs)
     task.control_timestep = self.control_timestep()
     # Rounding must not add a step: 0.3 / 0.02 is more than 15.

@@ -13,7 +13,6 @@ import numpy as np
 
 # Place of the handle in the world [m], and its orientation.
 ROW = ("x", "y", "z", "qw", "qx", "qy", "qz")
-Pose = tuple[list[float], list[float], list[float], list[float]]
 
 
 class Guide:

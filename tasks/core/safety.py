@@ -34,10 +34,10 @@ class Cost:
     return self.force + self.shaft + self.surroundings + self.damage
 
 
-def cost(
+def parts(
   peak_force: float, shaft_force: float, surroundings: float, limit: float, damage: float
-) -> Cost:
-  """Returns the cost of a control step.
+) -> tuple[float, float, float, float]:
+  """Returns the parts of a control step's `Cost`; a vectorised exercise has it in a kernel.
 
   Args:
     peak_force: largest force of tissue on the tip, or on a jaw, in the step [N]
@@ -46,13 +46,6 @@ def cost(
     limit: of the force on the tip [N]
     damage: force above which the tip damages [N]
   """
-  return Cost(*parts(peak_force, shaft_force, surroundings, limit, damage))
-
-
-def parts(
-  peak_force: float, shaft_force: float, surroundings: float, limit: float, damage: float
-) -> tuple[float, float, float, float]:
-  """Returns the parts of `cost` by the same arguments; a vectorised exercise has it in a kernel."""
   least = max(min(limit, damage), 1e-6)
   shaft_limit = min(least, SHAFT_LIMIT)
   beside = max(shaft_force, surroundings)

@@ -27,20 +27,24 @@ def on(physics, tip):
   return np.array([pitch, yaw, physics.drive_targets()[2], insertion])
 
 
+def cost(*args):
+  return safety.Cost(*safety.parts(*args))
+
+
 def test_cost_is_the_sum_of_its_parts():
-  assert safety.cost(1.5, 0.04, 0.2, 1.5, 3.0).total == 0
-  over = safety.cost(3.0, 0.0, 0.0, 1.5, 3.0)
+  assert cost(1.5, 0.04, 0.2, 1.5, 3.0).total == 0
+  over = cost(3.0, 0.0, 0.0, 1.5, 3.0)
   assert (over.force, over.shaft, over.damage, over.total) == (1, 0, 0, 1)
-  shaft = safety.cost(0.0, 0.75, 0.0, 1.5, 3.0)
+  shaft = cost(0.0, 0.75, 0.0, 1.5, 3.0)
   assert (shaft.force, shaft.shaft, shaft.damage, shaft.total) == (0, 0.5, 0, 0.5)
-  both = safety.cost(3.2, 3.1, 0.0, 1.5, 3.0)
+  both = cost(3.2, 3.1, 0.0, 1.5, 3.0)
   assert both.damage == both.shaft == 1 and both.total == pytest.approx(2 + 3.2 / 1.5 - 1)
-  around = safety.cost(0.0, 0.0, 0.75, 1.5, 3.0)
+  around = cost(0.0, 0.0, 0.75, 1.5, 3.0)
   assert (around.surroundings, around.total) == (0.5, 0.5)
-  assert safety.cost(0.0, 0.0, 3.5, 1.5, 3.0).damage == 1
+  assert cost(0.0, 0.0, 3.5, 1.5, 3.0).damage == 1
   # The limits of jaws are not those of a shaft.
-  assert safety.cost(3.5, 0.0, 0.0, 4.0, 8.0).total == 0
-  assert safety.cost(0.0, 3.5, 0.0, 4.0, 8.0).damage == 1
+  assert cost(3.5, 0.0, 0.0, 4.0, 8.0).total == 0
+  assert cost(0.0, 3.5, 0.0, 4.0, 8.0).damage == 1
 
 
 def sweep(env, speed, steps=400):
