@@ -19,6 +19,7 @@ constexpr double CLOSE = 1e-5;
 constexpr double SLOPE = 1e-4;  // of a step's decrease, the least (Armijo)
 constexpr double ROUNDED = 1e-15;  // of the cost, what is less than its last digits
 constexpr int HALVINGS = 30;
+constexpr double ENDLESS = 1e300;
 
 // What MuJoCo's rows are to their cost: both signs, one, or a cone, whose further rows follow.
 enum RowKind { BOTH, ONE, CONE, FRICTION };
@@ -133,15 +134,18 @@ PALPATE double rows_cost(const Fields& f, const double* x, double h, double* g, 
   return cost;
 }
 
+// The cost at a state; where constraints alone cost more than `most`, only that: no other part is negative.
 template <class Fields>
-PALPATE double step_cost(const Fields& f, const double* x, const double* turn, double h) {
+PALPATE double step_cost(const Fields& f, const double* x, const double* turn, double h, double most = ENDLESS) {
+  const double rows = h * h * rows_cost(f, x, h, nullptr, nullptr), least = sum_together(rows);
+  if (least > most) return least;
   double sum = 0.0;
   each_lane(0, f.nnode, [&](int i) {
     const D3 off = load(x + 3 * i) - load(f.aim.data + 3 * i);
     sum += 0.5 * f.mass.data[i] / (h * h) * dot(off, off) + 0.5 * f.spin.data[i] / (h * h) * turn[i] * turn[i];
   });
   const double own = sum + rod_energy(f, x, turn) + contacts_energy(f, x, h, nullptr, nullptr, false) +
-                     ties_energy(f, x, nullptr, nullptr) + h * h * rows_cost(f, x, h, nullptr, nullptr);
+                     ties_energy(f, x, nullptr, nullptr) + rows;
   return sum_together(own);
 }
 
@@ -270,8 +274,10 @@ PALPATE int step_rod(const Fields& f, double h) {
         store(trial + 3 * i, load(x + 3 * i) + part * load(f.move.data + 4 * i));
         trial_turn[i] = turn[i] + part * f.move.data[4 * i + 3];
       });
-      const double next = step_cost(f, trial, trial_turn, h);
-      if (next <= cost + SLOPE * part * falls || -part * falls < 1e-13 * cost) {
+      const double most = cost + SLOPE * part * falls;
+      const bool flat = -part * falls < 1e-13 * cost;
+      const double next = step_cost(f, trial, trial_turn, h, flat ? ENDLESS : most);
+      if (next <= most || flat) {
         cost = next;
         break;
       }

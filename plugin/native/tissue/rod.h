@@ -100,20 +100,38 @@ struct RodMatrix : Envelope {
   int per;          // unknowns of a node
 
   PALPATE int of(int node, int c) const { return per * rank[node] + c; }
+
+  // Adds value(c, d) for rows c of one node and columns d of another; of the same node's the lower triangle.
+  template <class Value>
+  PALPATE void add(int node, int rows, int other, int columns, Value value) const {
+    const int p = of(node, 0), q = of(other, 0);
+    if (q > p) {
+      for (int d = 0; d < columns; ++d) {
+        double* to = row(q + d) + p;
+        for (int c = 0; c < rows; ++c) to[c] += value(c, d);
+      }
+      return;
+    }
+    for (int c = 0; c < rows; ++c) {
+      double* to = row(p + c) + q;
+      for (int d = 0; d < (p == q ? c + 1 : columns); ++d) to[d] += value(c, d);
+    }
+  }
 };
 
 // What nodes add to the gradient, and to the matrix: the places of each, not its turn.
 template <int NODES>
 struct Terms {
   static constexpr int COUNT = 3 * NODES;
-  double g[COUNT] = {}, K[COUNT][COUNT] = {};
+  double g[COUNT] = {}, K[COUNT][COUNT] = {};  // of K the lower triangle
 
   // Force v, and stiffness v v^T.
   PALPATE void add(const double* v, double force, double stiffness) {
     for (int a = 0; a < COUNT; ++a) {
       g[a] += force * v[a];
       const double s = stiffness * v[a];
-      for (int b = 0; b < COUNT; ++b) K[a][b] += s * v[b];
+      const int most = a / 4 * 4 + 4;  // to the diagonal, by whole vectors
+      for (int b = 0; b < COUNT && b < most; ++b) K[a][b] += s * v[b];
     }
   }
   // Along `axis`, by the nodes' weights.
@@ -125,18 +143,14 @@ struct Terms {
   // Along every axis.
   PALPATE void add_each(const double* w, double stiffness) {
     for (int k = 0; k < NODES; ++k)
-      for (int m = 0; m < NODES; ++m)
+      for (int m = 0; m <= k; ++m)
         for (int c = 0; c < 3; ++c) K[3 * k + c][3 * m + c] += stiffness * w[k] * w[m];
   }
   PALPATE void scatter(const int* node, double* into, const RodMatrix& H) const {
     for (int k = 0; k < NODES; ++k) {
-      for (int c = 0; c < 3; ++c) {
-        const int a = 3 * k + c;
-        into[4 * node[k] + c] += g[a];
-        for (int m = 0; m < k; ++m)
-          for (int d = 0; d < 3; ++d) H.at(H.of(node[k], c), H.of(node[m], d)) += K[a][3 * m + d];
-        for (int d = 0; d <= c; ++d) H.at(H.of(node[k], c), H.of(node[k], d)) += K[a][3 * k + d];
-      }
+      for (int c = 0; c < 3; ++c) into[4 * node[k] + c] += g[3 * k + c];
+      for (int m = 0; m <= k; ++m)
+        H.add(node[k], 3, node[m], 3, [&](int c, int d) { return K[3 * k + c][3 * m + d]; });
     }
   }
 };
@@ -151,11 +165,11 @@ PALPATE void add_twist(const Fields& f, const Bent& b, int i, double twist, doub
   store(v + 4, me - mf);
   v[7] = 1.0;
   store(v + 8, mf);
-  for (int a = 0; a < 11; ++a) {
-    g[4 * i - 4 + a] += f.torsion.data[i] * twist * v[a];
-    for (int c = 0; c <= a; ++c)
-      H.at(H.of(i - 1 + a / 4, a % 4), H.of(i - 1 + c / 4, c % 4)) += f.torsion.data[i] * v[a] * v[c];
-  }
+  const double k = f.torsion.data[i];
+  for (int a = 0; a < 11; ++a) g[4 * i - 4 + a] += k * twist * v[a];
+  for (int n = 0; n < 3; ++n)
+    for (int m = 0; m <= n; ++m)
+      H.add(i - 1 + n, n < 2 ? 4 : 3, i - 1 + m, m < 2 ? 4 : 3, [&](int c, int d) { return k * v[4 * n + c] * v[4 * m + d]; });
 }
 
 // Adds the gradient of the energy and its second derivative, or where that is not to be `exact` a part of it
