@@ -160,7 +160,8 @@ def _module(header: str, kind: str, constants: tuple, tag: str) -> str:
     extra_build_dependencies=[str(NATIVE / each) for each in _includes(header)],
   )
   wp.set_module_options({"extra_build_options": options, "enable_backward": False}, name)
-  MODULES[kind].append(name)
+  if name not in MODULES[kind]:
+    MODULES[kind].append(name)
   return name
 
 
