@@ -1,14 +1,6 @@
 """Vectorised exercises: `gymnasium.make_vec("palpate/TouchEasy-v0", num_envs=4096)`.
 
-World i after `reset(seed=s)` is `gymnasium.make(...)` after `reset(seed=s + i)`: episodes are drawn
-from the same random states, and on the CPU every step is the same to the rounding of float32. Where
-an exercise has several shapes, each is that of a share of the worlds, in their order and for good:
-these are the single environments with `variants=(that shape,)`.
-
-Worlds whose episode ends begin another in the same step. Then `infos["final_obs"]` and
-`infos["final_info"]` have what the ended ones saw last, as Gymnasium has it for `SAME_STEP`: an
-array of objects, a dictionary where `infos["_final_obs"]`; with arrays of a device `final_obs` is a
-dictionary of arrays that are to be read where `infos["_final_obs"]`.
+docs/vector.md says what seeds, the ends of episodes and shapes are in many worlds.
 """
 
 from __future__ import annotations

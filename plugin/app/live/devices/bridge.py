@@ -1,31 +1,6 @@
 """Any other device, over UDP: a program of its own sends poses and gets forces.
 
-A packet to here, little-endian, 44 bytes:
-
-| offset | type | what |
-|---|---|---|
-| 0 | 4 bytes | `PALP` |
-| 4 | uint8 | 1, the version |
-| 5 | uint8 | 1: there is an orientation; 2: there is an opening of the jaws |
-| 6 | uint16 | buttons held: 1 clutch, 2 grip, 4 report, 8 pause |
-| 8 | uint32 | number of the packet; one that is not above the last is thrown away |
-| 12 | 3 float32 | place [m]: x to the right, y up, z towards the person |
-| 24 | 4 float32 | orientation, w x y z |
-| 40 | float32 | opening of the jaws, 1 is wide open, -1 squeezes |
-
-Each is answered with the force of that moment, to where it came from, 36 bytes:
-
-| offset | type | what |
-|---|---|---|
-| 0 | 4 bytes | `PALF` |
-| 4 | uint8 | 1, the version |
-| 5 | 3 bytes | 0 |
-| 8 | uint32 | number of the last packet |
-| 12 | 3 float32 | force on the hand [N], in the same axes |
-| 24 | 3 float32 | torque on the hand [N m] |
-
-A sender that hears nothing for 50 ms sets its forces to zero by itself. Who sent first is listened
-to alone, until that one has said nothing for 2 s.
+The packets are in docs/live.md.
 """
 
 from __future__ import annotations
