@@ -98,8 +98,19 @@ PALPATE void stand_ahead(const Fields& f, int world, Team& group, const Mine& sl
   meet_block();
 }
 
-// The step, or with RESPONSE the answer to the impulses in `rhs`, for which the matrix is made anew;
-// nothing of a world whose step has no length.
+// Whether a world has impulses in `rhs`.
+template <class Fields, class Team, class Mine>
+PALPATE bool is_pushed(const Fields& f, size_t base, Team& group, const Mine& slices) {
+  V any = splat(0.0f);
+  slices.each([&](int s, Lane lane, int) {
+    const V3 b = ld3(f.system.rhs.data + base + 24 * s, lane);
+    any = select((b.x != 0.0f) | (b.y != 0.0f) | (b.z != 0.0f), splat(1.0f), any);
+  });
+  return group.most(any) > 0.0f;
+}
+
+// The step, or with RESPONSE the answer to the impulses in `rhs`, for which the matrix is made anew
+// where there are any; nothing of a world whose step has no length.
 template <class Fields>
 PALPATE void step_world(const Fields& f, Thread t, int stage) {
   using Mine = Slices<OWN>;
@@ -111,6 +122,12 @@ PALPATE void step_world(const Fields& f, Thread t, int stage) {
   const size_t base = 24 * (size_t)t.world * f.shape.nslice;
   Group<SUMS> group(t, f.system.partial.data);
   const Mine slices(group, f.shape.nslice);
+  if (stage == RESPONSE && !is_pushed(f, base, group, slices)) {
+    const V3 none = {splat(0.0f), splat(0.0f), splat(0.0f)};
+    slices.each([&](int s, Lane lane, int) { st3(f.system.sol.data + base + 24 * s, none, lane); });
+    if (group.is_first()) f.system.ratio.data[t.world] = 1.0f;
+    return;
+  }
   Home at = home(f, t.world);
   if (stage == RESPONSE) at.rows.rhs = f.system.r.data + base;
   stand_ahead(f, t.world, group, slices, at);
