@@ -1,6 +1,5 @@
 """One organ in one mjData, as its passive forces and its coupling see it."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 from typing import Any
 
 import numpy as np

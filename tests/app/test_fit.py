@@ -143,7 +143,8 @@ def test_the_command_names_what_the_data_do_not_determine(tmp_path, capsys, reco
   rough = dataclasses.replace(record, force=record.force + noise)
   data, out = written(tmp_path / "data.csv", rough), tmp_path / "out"
   free = ["--free", "young", "poisson", "--set", "damping=0.02", "--set", "poisson=0.4"]
-  code, shown = run(capsys, data, *WORDS, *free, "-o", out)
+  coarse = ["--edge", "0.006", "--h", "0.005"]
+  code, shown = run(capsys, data, *WORDS, *coarse, *free, "-o", out)
   assert code == 0, shown.err
   assert re.search("do not determine poisson: it is kept at 0.4, .* --set poisson=VALUE", shown.err)
   assert re.search(r"^poisson +0.4, kept", shown.out, re.M)

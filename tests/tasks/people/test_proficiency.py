@@ -31,7 +31,7 @@ def mean(results):
   return np.mean([result.composite for result in results])
 
 
-@pytest.mark.parametrize("name", ["touch/easy", "trace/easy"])
+@pytest.mark.parametrize("name", ["touch/easy", pytest.param("trace/easy", marks=pytest.mark.slow)])
 def test_fresh_performers_rank_as_they_should(name):
   expert, people = scores(name, "expert", range(60, 62)), scores(name, "skilled", range(60, 62))
   novice = scores(name, "novice", range(60, 62))
