@@ -12,7 +12,7 @@ import mujoco
 from palpate import tasks
 from palpate.tasks.core import performer
 
-FOLDER = pathlib.Path(__file__).parents[1] / "plugin/app/live/page/cards"
+FOLDER = pathlib.Path(__file__).parents[1] / "plugin/app/live/page/static/cards"
 SIZE, SECONDS = (250, 400), 1.0
 
 for domain, task in tasks.ALL_TASKS:

@@ -120,7 +120,7 @@ def test_one_smooth_movement_is_asked_for_where_there_were_several():
 
 def test_what_is_said_is_in_the_table_of_words():
   """Exercises, metrics and what helps have German words; numbers stay in their order."""
-  texts = pathlib.Path(str(page.__file__)).with_name("texts.js")
+  texts = pathlib.Path(str(page.__file__)).with_name("static") / "texts.js"
   german = texts.read_text().partition("const ENGLISH")[0]
   words = dict(re.findall(r'"((?:[^"\\]|\\.)*)":\s*"((?:[^"\\]|\\.)*)"', german))
   names = [word for domain, level in suite.ALL_TASKS for word in (f"{domain}/", *level.split("_"))]

@@ -23,7 +23,7 @@ from websockets.sync.server import ServerConnection, serve
 from ...trainee.keeping import Keeping
 from . import worker
 
-_HERE = pathlib.Path(__file__).parent
+_STATIC = pathlib.Path(__file__).with_name("static")
 _KINDS = {
   ".html": "text/html; charset=utf-8",
   ".js": "text/javascript; charset=utf-8",
@@ -31,10 +31,10 @@ _KINDS = {
   ".svg": "image/svg+xml; charset=utf-8",
   ".webp": "image/webp",
 }
-# What is served, and nothing else: the page's own files, three.js and the pictures of the cards.
-_FILES = {"/": _HERE / "page.html"} | {
-  f"/{path.relative_to(_HERE).as_posix()}": path
-  for path in _HERE.rglob("*")
+# What is served, and nothing else.
+_FILES = {"/": _STATIC / "page.html"} | {
+  f"/{path.relative_to(_STATIC).as_posix()}": path
+  for path in _STATIC.rglob("*")
   if path.suffix in _KINDS and path.name != "page.html"
 }
 _LARGEST = 4096  # message from a page [bytes]
