@@ -14,6 +14,7 @@ const MEAN = 0.3;  // over which steps are counted [s]
 const AGAIN = 2000;  // between tries to reach the program [ms]
 const WORDS = 100;  // between numbers in words, which are laid out anew [ms]
 const ENOUGH = 40, PROMPT = 0.9;  // frames to judge by whether most of them are drawn
+const PATIENCE = 3000;  // with an exercise that loads, until it is said what takes so long [ms]
 const SILENT = 5000;  // without a picture, until that is said [ms]
 const LONGEST = 100;  // that a picture lies behind what came [ms]
 const KEPT = 5000;  // of the times from hand to picture
@@ -35,6 +36,7 @@ let scene = null, frame = null, head = {}, rest = null, running = false, paused 
 let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble = "", warned = "", late = null;
 let last = null, arrived = 0, span = 0, mixed = null, pictured = 0;  // frames between which pictures lie [ms]
 let waited = false;  // for a movement
+let loading = null;  // what loads, and since when [ms]
 let silent = "";  // what was said about a program that says nothing
 let turn = 0, plotted = 0, told = 0, came = 0, shown = 0;
 const plots = {force: new Plot("force"), way: new Plot("way"), rate: new Plot("rate")};
@@ -115,10 +117,12 @@ const HEAR = {
   loading({text, note}) {
     tell("");
     $("welcome").replaceChildren();
-    $("instruction").textContent = t(note ? "Loading {0}, which takes a minute or more" : "Loading {0}", offer.tasks[text] ? title(text) : text);
+    loading = {text: t(note ? "Loading {0}, which takes a minute or more" : "Loading {0}", offer.tasks[text] ? title(text) : text), since: performance.now()};
+    $("instruction").textContent = loading.text;
   },
   scene(message) {
     scene = message;
+    loading = null;
     frame = last = rest = trace = before = null;
     came = shown = told = 0;
     pressed("ghost", false);
@@ -242,6 +246,7 @@ function hands() {
 
 function run(on) {
   running = on;
+  loading = null;
   document.body.classList.toggle("running", on);
   paused = false;
   $("pause").textContent = t("Pause");
@@ -368,8 +373,10 @@ function targets() {
 const hear = () => running && hand.say().forEach(say);
 setInterval(hear, TELL);  // pictures may be further apart
 
-// A program that says nothing is named, where it should move.
+// A program that says nothing is named, where it should move, and one that loads for long.
 setInterval(() => {
+  const waits = loading ? performance.now() - loading.since : 0;
+  if (waits > PATIENCE) $("instruction").textContent = t("{0}: {1} s. The first time, kernels are compiled, for up to a minute", loading.text, Math.round(waits / 1e3));
   if (!running || paused || STATES[head.state] !== "ready") return;
   const passed = performance.now() - arrived;
   if (passed > SILENT) tell(silent = t("No picture from the program for {0} s", Math.round(passed / 1e3)));

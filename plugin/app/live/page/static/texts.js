@@ -74,6 +74,7 @@ const GERMAN = {
   "push one throw down, and close the slit to # mm": "schiebe einen Wurf hinunter und schließe den Schlitz auf # mm",
   // What runs.
   "Loading {0}": "Lädt {0}", "Loading {0}, which takes a minute or more": "Lädt {0}, das dauert eine Minute oder mehr",
+  "{0}: {1} s. The first time, kernels are compiled, for up to a minute": "{0}: {1} s. Beim ersten Mal werden Rechenkerne übersetzt, bis zu einer Minute lang",
   "Choose an exercise and press Start.": "Wähle eine Übung und drücke Start.",
   "Choose an organ and press Start. Every choice may be changed while it runs.": "Wähle ein Organ und drücke Start. Alles lässt sich ändern, während es läuft.",
   "No connection to the program. Recordings are kept. Connecting again": "Keine Verbindung zum Programm. Aufnahmen sind gesichert. Verbindet neu",
