@@ -18,8 +18,6 @@ from .console import CommandError, Interrupt, Progress, output, output_folder, w
 from .draw import film
 from .trainee import keeping
 
-_SMALL = (320, 240)  # of each picture at the top of a report
-
 
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
@@ -288,7 +286,7 @@ def _views(args: argparse.Namespace, job: _Job) -> film.Strip | None:
   """Returns what takes the report's pictures; None where a person would wait for them."""
   by_hand = args.device or args.performer == "keyboard"
   wanted = job.folder and not (args.no_report or job.film or by_hand)
-  return film.Strip(_SMALL) if wanted else None
+  return film.Strip() if wanted else None
 
 
 def _write(job: _Job, recording: Any, report: bool, views: film.Strip | None) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser):
     help="folder of report.html or comparison.html (the first recording's folder)",
   )  # fmt: skip
   keeping.add_references(parser)
-  add("--film", action="store_true", help="replay the exercise and put its film in the page")
+  views = parser.add_mutually_exclusive_group()
+  views.add_argument(
+    "--film", action="store_true", help="replay the exercise for its film, in place of pictures"
+  )
+  views.add_argument(
+    "--no-pictures", action="store_true", help="do not replay the exercise for its pictures"
+  )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -38,16 +45,18 @@ def main(args: argparse.Namespace) -> int:
   paths = [pathlib.Path(name) for name in args.recordings]
   if args.film:
     film.check(".mp4")
-    palpate.register()
+  palpate.register()
   try:
-    entries = _entries(paths, keeping.references(args.references), args.film)
+    entries = _entries(paths, keeping.references(args.references), args.film, args.no_pictures)
     folder = output_folder("out", args.out or paths[0].parent)
     with writing(folder):
       if len(entries) > 1:
         page = comparison.write_comparison(entries, folder)
       else:
         (one,) = entries
-        page = report.write_report(one.recording, folder, one.reference, film=one.film)
+        page = report.write_report(
+          one.recording, folder, one.reference, film=one.film, pictures=one.pictures
+        )
   except (OSError, ValueError) as error:
     raise CommandError(str(error)) from None
   except ImportError as error:
@@ -56,8 +65,10 @@ def main(args: argparse.Namespace) -> int:
   return 0
 
 
-def _entries(paths: Sequence[pathlib.Path], references: Lookup, filmed: bool) -> list[Any]:
-  """Returns what is compared: recordings, references and films."""
+def _entries(
+  paths: Sequence[pathlib.Path], references: Lookup, filmed: bool, blind: bool
+) -> list[Any]:
+  """Returns what is compared: recordings, references, and films or pictures."""
   from palpate.tasks.people import comparison
   from palpate.tasks.recording import Recording
 
@@ -66,8 +77,18 @@ def _entries(paths: Sequence[pathlib.Path], references: Lookup, filmed: bool) ->
     recording = Recording.load(path)
     known = references(str(recording.info.get("task", "")))
     shot = film.of_recording(recording, _SIZE) if filmed else None
-    entries.append(comparison.Entry(name, recording, known, shot))
+    pictures = None if filmed or blind else _pictures(recording)
+    entries.append(comparison.Entry(name, recording, known, shot, pictures))
   return entries
+
+
+def _pictures(recording: Any) -> Any:
+  """Returns the pictures of a recorded exercise, None with a word where there are none."""
+  try:
+    return film.strip(recording)
+  except CommandError as error:
+    print(error, file=sys.stderr)
+    return None
 
 
 def _names(paths: Sequence[pathlib.Path]) -> list[str]:

@@ -59,7 +59,7 @@ from .handle import ROW
 from .instrument import SCOPE, axes, jawed
 from .physics import Physics, check_scene
 from .randomisation import Ranges
-from .rules import DAMAGED, HIDDEN, NOW, OUTCOMES, SUCCESS
+from .rules import DAMAGED, HIDDEN, MISSED, NOW, OUTCOMES, SUCCESS
 from .scenes import ORGAN, Scene
 from .stage import STATE, Stage
 
@@ -278,8 +278,8 @@ class Task(engine.Task):
     """Returns the progress after a control step; sets `outcome` on success or failure."""
     _, progress, outcome = self.rules.advance(physics, self)
     self.outcome = OUTCOMES[outcome]
-    if outcome == DAMAGED:
-      self.event(physics, "note", label=self.label("damage"))
+    if outcome in (DAMAGED, MISSED):
+      self.event(physics, "note", label=self.label(OUTCOMES[outcome]))
     self.show(physics)
     return 1.0 if outcome == SUCCESS else progress
 

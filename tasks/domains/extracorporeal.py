@@ -194,6 +194,8 @@ class Extracorporeal(Task):
       tied = [-self.hand * (-1) ** k for k in range(self.throws)]
       right = sorted(knots.throws(places) or ()) == sorted(tied)
       self.outcome = "success" if right and self.gap < CLOSED else "missed"
+      if self.outcome == "missed":
+        self.event(physics, "note", label="the knot did not hold" if right else "a wrong knot")
     return 0.95
 
   def tie(self, physics: Physics) -> None:

@@ -169,14 +169,24 @@ class Needlework(Task):
     return np.array([-1.0 if (self.left_holds if hand else self.right_holds) else WIDE])
 
   def label(self, kind: str) -> str:
-    """Returns what a drop is."""
+    """Returns what a drop is, or why an exercise failed."""
+    if kind == "missed":
+      return "the needle was dropped"
     return "needle" if kind == "drop" else super().label(kind)
 
 
 class Stitching(Needlework):
-  """An exercise that drives a needle through marks of a wall; `pull` is that on it [N]."""
+  """An exercise that drives a needle through marks of a wall.
+
+  Attributes:
+    pull: on the wall [N]
+    tolerance: how far holes may be from their marks [m]
+    misses: how far they are [m]
+  """
 
   pull: float
+  tolerance: float
+  misses: np.ndarray
 
   def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
     """Returns all of the wall, and its middle."""
@@ -190,6 +200,8 @@ class Stitching(Needlework):
     """Returns what an event of the rules is called."""
     if kind == "damage":
       return f"torn by a pull of {self.pull:.2f} N"
+    if kind == "missed" and self.misses.max() > self.tolerance:
+      return "a hole is too far from its mark"
     return "hole" if kind == "target" else super().label(kind)
 
 

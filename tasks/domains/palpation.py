@@ -222,8 +222,8 @@ class Palpate(Task):
     self.touched, self.felt = np.zeros(self.nplace, int), 0.0
 
   def label(self, kind: str) -> str:
-    """Returns what was done there."""
-    return "report"
+    """Returns what was done there, or why it failed."""
+    return "reported a wrong place" if kind == "missed" else "report"
 
   def instruct(self, physics: Physics) -> str:
     """Says to feel, and to report."""

@@ -365,6 +365,11 @@ class Running(Stitching):
       "tension": self.tight, "torn": self.torn,
     }  # fmt: skip
 
+  def label(self, kind: str) -> str:
+    """Returns what an event of the rules is called."""
+    lost = self.loose > LOST or self.misses.max() > self.tolerance
+    return "a stitch came out" if kind == "missed" and not lost else super().label(kind)
+
   def instruct(self, physics: Physics) -> str:
     """Says what is next."""
     if self.done == STITCHES:

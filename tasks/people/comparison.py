@@ -10,12 +10,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..metrics import METRICS, Metrics, Spec, number
 from ..recording import Recording
 from . import page
 from .page import text
 from .plots import compared_figure, path_figure, png
-from .report import ending, verdict, write_page
+from .report import ending, verdict, views, write_page
 from .score import SUCCESS, WEIGHTS, Score, score
 
 
@@ -28,12 +30,14 @@ class Entry:
     recording: the exercise
     reference: see `score.make_reference`; None without one
     film: of the exercise, MP4; None without one
+    pictures: of the exercise  (n, height, width, 3) uint8; None without any
   """
 
   name: str
   recording: Recording
   reference: Mapping[str, Any] | None = None
   film: bytes | None = None
+  pictures: np.ndarray | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,15 +58,15 @@ def render(entries: Sequence[Entry]) -> str:
   title = " and ".join(dict.fromkeys(_task(e) for e in entries))
   paths = [(e.name, path_figure(e.recording)) for e in entries]
   pictures = [(name, page.image(png(f), f"tip path of {name}")) for name, f in paths if f]
-  films = [(e.name, page.film(e.film, f"film of {e.name}")) for e in entries if e.film]
+  seen = [(e.name, views(e.film, e.pictures, e.name)) for e in entries]
   over_time = compared_figure([(e.name, e.recording) for e in entries])
   return page.document(
     title,
     [
       f"<h1>{text(title)}</h1>",
       f"<p class='faint'>{text(', '.join(e.name for e in entries))}, side by side</p>",
+      page.beside([(name, shown) for name, shown in seen if shown]),
       _outcomes(measured),
-      f"<h2>Films</h2>{page.beside(films)}" if films else "",
       f"<h2>Path</h2>{page.beside(pictures)}" if pictures else "",
       f"<h2>Force and speed</h2>{page.image(png(over_time), 'force and speed over time')}"
       if over_time

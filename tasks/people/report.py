@@ -23,7 +23,7 @@ _MOST_EVENTS = 50
 _ENDS = {
   SUCCESS: "Success",
   "damage": "Failed: tissue was harmed",
-  "missed": "Failed: reported a wrong place",
+  "missed": "Failed: it was missed",
   "time limit": "Failed: the time ran out",
   "stopped": "Stopped before the end",
   INTERRUPTED: "Interrupted: the program was killed, this is what it had written",
@@ -76,7 +76,7 @@ def render(
     f"<h1>{text(title)}</h1>",
     _outcome(recording),
     f"<p class='faint'>{text(_summary(recording))}</p>",
-    _views(film, pictures),
+    views(film, pictures),
     _score_part(result),
     _plots(recording, metrics),
     _metric_table(recording, metrics, reference, result),
@@ -93,7 +93,7 @@ def ending(recording: Recording) -> str:
     return "How it ended was not recorded"
   words = _ENDS.get(outcome, f"Failed: {outcome}")
   notes = [event.label for event in recording.events if event.kind == "note" and event.label]
-  if outcome == "damage" and notes and notes[-1] != SUCCESS:  # the exercise's, of what harmed it
+  if outcome in ("damage", "missed") and notes and notes[-1] != SUCCESS:  # the exercise's own
     words = f"Failed: {notes[-1]}"
   if len(recording.time):
     words += f", after {number(float(recording.time[-1] - recording.time[0]))} s"
@@ -117,14 +117,22 @@ def _summary(recording: Recording) -> str:
   )
 
 
-def _views(film: bytes | None, pictures: np.ndarray | None) -> str:
+def views(film: bytes | None, pictures: np.ndarray | None, whose: str = "") -> str:
+  """Returns an exercise's film, or else its pictures side by side, where there are some.
+
+  Args:
+    film: MP4
+    pictures: (n, height, width, 3) uint8
+    whose: the exercise's name, where there are several
+  """
+  about = f"{whose}: " * bool(whose) + "what the laparoscope saw"
   if film is not None:
-    return page.film(film, "what the laparoscope saw")
+    return page.film(film, about)
   if pictures is None:
     return ""
   count = len(pictures)
   shown = (
-    page.image(jpeg(each), f"what the laparoscope saw, picture {k + 1} of {count}", "jpeg")
+    page.image(jpeg(each), f"{about}, picture {k + 1} of {count}", "jpeg")
     for k, each in enumerate(pictures)
   )
   return f"<div class='strip'>{''.join(shown)}</div>"

@@ -12,6 +12,7 @@ import threading
 import time
 import types
 
+import imageio.v3 as iio
 import mujoco
 import numpy as np
 import pytest
@@ -85,6 +86,32 @@ def test_films(tmp_path, capsys):
   page = (tmp_path / "a" / "report.html").read_text()
   data = re.search(r"<video [^>]*src='data:video/mp4;base64,([^']*)'", page)[1]
   assert base64.b64decode(data)[4:8] == b"ftyp"
+
+
+def test_a_report_begins_with_pictures_with_and_without_opengl(tmp_path, capsys, monkeypatch):
+  words = ["exercise", "touch/easy", "--set", "time_limit=0.1", "--no-report", "--out", "a"]
+  assert cli.main(words) == 0
+  path, drawn = tmp_path / "a" / "recording.npz", []
+
+  def pictures(*more):
+    assert cli.main(["report", str(path), *more]) == 0
+    page = (tmp_path / "a" / "report.html").read_text()
+    found = re.findall(r"data:image/jpeg;base64,([^']*)'", page.partition("<h2>")[0])
+    return [iio.imread(base64.b64decode(each)).astype(int) for each in found]
+
+  drawn.append(pictures())
+  monkeypatch.setattr(mujoco.Renderer, "render", None)
+  drawn.append(pictures())
+  assert len(drawn[0]) == len(drawn[1]) == 5
+  for one, other in zip(*drawn, strict=True):
+    assert one.std() > 20 and 0 < np.abs(one - other).mean() < 8
+  assert not pictures("--no-pictures")
+  made = Recording.load(path)
+  made.arrays["action"][2:] = 0.5
+  made.save(path)
+  capsys.readouterr()
+  assert not pictures()
+  assert "no pictures: the replay differs in column" in capsys.readouterr().err
 
 
 def test_a_replay_leaves_the_recording_alone(tmp_path, capsys):

@@ -47,6 +47,15 @@ class Table:
     """Returns the cases that have rows."""
     return {row["case"] for row in read(self.path)} if self.path.exists() else set()
 
+  def drop(self, cases: Iterable[str]):
+    """Takes out the rows of cases that are to be run again."""
+    gone = set(cases) & self.done()
+    if gone:
+      with open(self.path, newline="", encoding="utf-8") as file:
+        head, *lines = csv.reader(file)
+      self.path.write_text("")
+      self._append([head, *(line for line in lines if line[0] not in gone)])
+
   def write(self, case: str, status: str, rows: list[Row]):
     """Appends the rows of a case."""
     head = []

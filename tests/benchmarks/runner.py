@@ -86,7 +86,8 @@ def options(bench: Bench, words: list[str]) -> argparse.Namespace:
       help="stop after so long; --resume goes on from there")  # fmt: skip
   add("--draw", action="store_true", help="only draw figures and page from the rows there are")
   add("--only", metavar="CASE", action="append", default=[],
-      help="run this case again and print its rows; may be repeated")  # fmt: skip
+      help="run this case again and print its rows; may be repeated; with --resume they take "
+           "the place of the earlier ones")  # fmt: skip
   bench.arguments(parser)
   args = parser.parse_args(words)
   if args.jobs < 0:
@@ -104,7 +105,7 @@ def main(bench: Bench, words: list[str]) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
   except OSError as error:
     raise CommandError(f"cannot write to {str(args.out)!r}: {error.strerror}") from None
-  if args.only:
+  if args.only and not args.resume:
     return _again(bench, args)
   complete = args.draw or execute(bench, args)
   path = bench.path(args)
@@ -118,13 +119,19 @@ def main(bench: Bench, words: list[str]) -> int:
   return 130 if not complete else int(bool(failed))
 
 
-def _again(bench: Bench, args: argparse.Namespace) -> int:
-  """Runs single cases and prints their rows, which go into no file."""
+def _chosen(bench: Bench, args: argparse.Namespace) -> dict[str, Case]:
+  """Returns all cases by name; CommandError where one that is asked for is none of them."""
   cases = {case["case"]: case for stage in bench.stages(args) for case in stage}
   for name in args.only:
     if name not in cases:
       near = difflib.get_close_matches(name, cases, 3, 0) or ["none"]
       raise CommandError(f"no case {name!r} in this bench, the nearest are {', '.join(near)}")
+  return cases
+
+
+def _again(bench: Bench, args: argparse.Namespace) -> int:
+  """Runs single cases and prints their rows, which go into no file."""
+  cases = _chosen(bench, args)
   workers.register_quietly()
   for name in args.only:
     try:
@@ -146,7 +153,9 @@ def execute(bench: Bench, args: argparse.Namespace) -> bool:
   """Runs the cases that are not done and returns whether all are done now."""
   args.out.mkdir(parents=True, exist_ok=True)
   path = bench.path(args)
+  _chosen(bench, args)
   table = results.Table(path, bench.columns, args.resume)
+  table.drop(args.only)
   done = table.done()
   stages = bench.stages(args)
   total = sum(len(stage) for stage in stages)
@@ -173,6 +182,8 @@ def execute(bench: Bench, args: argparse.Namespace) -> bool:
   mine = {key: value for key, value in vars(args).items() if key not in _COMMON}
   # Of a path the name alone: where things lie on a machine is nobody's business.
   mine = {k: v.name if isinstance(v, pathlib.Path) else str(v) for k, v in mine.items()}
+  if args.only:
+    mine["only"] = ", ".join(args.only)  # the other rows are older
   results.note(path, results.machine() | {
     "bench": bench.name,
     "short": args.short,

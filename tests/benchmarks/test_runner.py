@@ -60,6 +60,12 @@ def test_in_one_process_a_case_that_fails_ends_the_run_and_it_resumes_there(tmp_
   ]
   about = results.notes(tmp_path / "small.csv")
   assert about["done"] == about["cases"] == 4 and "cpu" in about
+  assert execute(SMALL, "--out", tmp_path, "--resume", "--only", "n1")
+  rows = rows_of(tmp_path / "small.csv")
+  assert [r["case"] for r in rows] == ["n0", "n2", "n3", "n1"] and rows[-1]["square"] == 1
+  assert results.notes(tmp_path / "small.csv")["options"] == {"only": "n1"}
+  with pytest.raises(CommandError, match="the nearest are"):
+    execute(SMALL, "--out", tmp_path, "--resume", "--only", "n9")
 
 
 def test_results_of_another_form_are_not_resumed(tmp_path):

@@ -40,6 +40,7 @@ def test_a_hole_beside_its_mark_is_a_miss():
     env.task.marks = real
   assert env.task.outcome == "missed" and env.task.holes == 1
   assert env.task.misses[0] == pytest.approx(0.004, abs=5e-4)
+  assert env.task.take_events()[-1].label == "a hole is too far from its mark"
 
 
 def test_who_lets_go_has_missed():

@@ -67,7 +67,8 @@ def test_a_needle_that_nobody_holds_is_lost():
   while not timestep.last():
     timestep = env.step(teacher(timestep))
   assert env.task.outcome == "missed" and env.physics.time() < 1.5
-  assert [event.kind for event in env.task.take_events()] == ["drop"]
+  said = [(event.kind, event.label) for event in env.task.take_events()]
+  assert said == [("drop", "needle"), ("note", "the needle was dropped")]
 
 
 def test_two_rings_there_and_back():

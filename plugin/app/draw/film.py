@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..console import CommandError, need, writing
+from ..console import CommandError, Progress, need, writing
 
 if TYPE_CHECKING:
   import mujoco
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 FILMS = (".mp4", ".gif")
 PICTURES = (".png", ".webp", ".jpg")
 _FPS = 25  # of the laparoscope
+_SMALL = (320, 240)  # each picture of a strip [pixels]
 _MOST_PIXELS = 8192
 
 
@@ -62,54 +63,67 @@ def laparoscope(path: pathlib.Path, size: tuple[int, int]) -> Iterator[Callable[
     path: of the film
     size: width and height [pixels]
   """
-  due = -math.inf
+  due, look = -math.inf, Look(size)
   with write(path, _FPS) as frame:
 
     def shoot(env: Any) -> None:
       nonlocal due
       if env.physics.time() >= due - 1e-9:
         due = env.physics.time() + 1 / _FPS
-        frame(_look(env, size))
+        frame(look(env))
 
     yield shoot
 
 
-def _look(env: Any, size: tuple[int, int]) -> np.ndarray:
-  """Returns the laparoscope's picture of an environment, (height, width, 3) uint8."""
-  from palpate.tasks.core.scenes import CAMERA
+class Look:
+  """Draws what the laparoscope of an environment sees: call it with that.
 
-  camera = env.physics.model.ptr.camera(CAMERA).id
-  return env.physics.render(size[1], size[0], camera_id=camera)
+  MuJoCo's renderer does, or where there is no OpenGL that of batches, on the CPU.
+
+  Args:
+    size: width and height [pixels]
+  """
+
+  def __init__(self, size: tuple[int, int]):
+    self._size, self._opengl = size, True
+
+  def __call__(self, env: Any) -> np.ndarray:
+    """Returns the picture  (height, width, 3) uint8."""
+    from palpate.tasks.core import eyes, observation, scenes
+
+    physics, (width, height) = env.physics, self._size
+    if self._opengl:
+      try:
+        return physics.render(height, width, camera_id=physics.model.ptr.camera(scenes.CAMERA).id)
+      except Exception:  # each backend of OpenGL has its own
+        self._opengl = False
+    labels, begins = observation.labels(physics), physics.time() == 0
+    seen = eyes.see(physics, labels, "cpu", (height, width), ("pixels",), (0.0,), begins)
+    return seen["pixels"][0]
 
 
 class Strip:
   """Pictures of an exercise, evenly over its time, for a report: call it after every step.
 
-  There are none where nothing can draw.
-
   Args:
-    size: width and height of each [pixels]
     count: how many
+    end: when the exercise ends, None where nobody knows [s]
   """
 
-  def __init__(self, size: tuple[int, int], count: int = 5):
-    self._size, self._count = size, count
+  def __init__(self, count: int = 5, end: float | None = None):
+    self._look, self._count = Look(_SMALL), count
     self._frames: list[np.ndarray] = []
-    self._every, self._due = 0.5, 0.0  # [s]
+    self._every, self._due = 0.5 if end is None else end / (count - 1), 0.0  # [s]
 
   def __call__(self, env: Any) -> None:
     """Takes the laparoscope's picture if it is due."""
     time = env.physics.time()
     if time < self._due - 1e-9:
       return
-    try:
-      self._frames.append(_look(env, self._size))
-    except Exception:  # each backend of OpenGL has its own
-      self._due = math.inf
-      return
+    self._frames.append(self._look(env))
     if len(self._frames) == 4 * self._count:  # the exercise is a long one
       self._frames, self._every = self._frames[::2], 2 * self._every
-    self._due = time + self._every
+    self._due += self._every
 
   def pictures(self) -> np.ndarray | None:
     """Returns the pictures  (n, height, width, 3) uint8; None without any."""
@@ -121,17 +135,46 @@ class Strip:
 
 
 def of_recording(recording: Any, size: tuple[int, int]) -> bytes:
-  """Returns the MP4 of a recorded exercise, run anew; CommandError if it comes out differently."""
-  from palpate.tasks.core import episode
-
+  """Returns the MP4 of a recorded exercise, see `again`."""
   check(".mp4")
   with tempfile.TemporaryDirectory() as folder:
     path = pathlib.Path(folder) / "film.mp4"
     with laparoscope(path, size) as shoot:
-      again = episode.replay(recording, shoot)
-    if changed := episode.differences(recording, again):
-      raise CommandError(f"no film: the replay differs in {', '.join(changed)}", code=1)
+      again(recording, shoot)
     return path.read_bytes()
+
+
+def strip(recording: Any) -> np.ndarray | None:
+  """Returns pictures of a recorded exercise, see `Strip` and `again`."""
+  if not len(recording.time):
+    return None
+  views = Strip(end=float(recording.time[-1]))
+  again(recording, views)
+  return views.pictures()
+
+
+def again(recording: Any, shoot: Callable[[Any], None]) -> None:
+  """Runs a recorded exercise anew, to take its pictures after every step.
+
+  Raises:
+    CommandError: it is none that can be run, or it comes out differently.
+  """
+  from palpate.tasks.core import episode
+
+  progress, end = Progress(), recording.time[-1] if len(recording.time) else 0.0
+
+  def watch(env: Any) -> None:
+    shoot(env)
+    progress.show(f"pictures: {env.physics.time():.1f} of {end:.1f} s")
+
+  try:
+    made = episode.replay(recording, watch)
+  except (ValueError, episode.EpisodeError) as error:
+    raise CommandError(f"no pictures: {error}", code=1) from None
+  finally:
+    progress.clear()
+  if changed := episode.differences(recording, made):
+    raise CommandError(f"no pictures: the replay differs in {', '.join(changed)}", code=1)
 
 
 def check(suffix: str):

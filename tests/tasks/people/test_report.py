@@ -188,7 +188,7 @@ def test_what_the_expert_has_and_the_recording_lacks_is_shown():
   [
     ("damage", "Failed: tissue was harmed, after 2 s"),
     ("time limit", "Failed: the time ran out, after 2 s"),
-    ("missed", "Failed: reported a wrong place, after 2 s"),
+    ("missed", "Failed: it was missed, after 2 s"),
     ("stopped", "Stopped before the end, after 2 s"),
     ("dropped the needle", "Failed: dropped the needle, after 2 s"),
     ("error", "after 2 s: ValueError: action is nan"),

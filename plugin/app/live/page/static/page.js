@@ -37,6 +37,7 @@ let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble 
 let last = null, arrived = 0, span = 0, mixed = null, pictured = 0;  // frames between which pictures lie [ms]
 let waited = false;  // for a movement
 let loading = null;  // what loads, and since when [ms]
+let slow = "";  // where it runs slower than is asked for
 let silent = "";  // what was said about a program that says nothing
 let turn = 0, plotted = 0, told = 0, came = 0, shown = 0;
 const plots = {force: new Plot("force"), way: new Plot("way"), rate: new Plot("rate")};
@@ -125,6 +126,7 @@ const HEAR = {
     loading = null;
     frame = last = rest = trace = before = null;
     came = shown = told = 0;
+    slow = "";
     pressed("ghost", false);
     view.load(scene);
     for (const plot of Object.values(plots)) plot.clear();
@@ -333,7 +335,7 @@ function take(numbers) {
   $("progress-text").textContent = `${Math.round(100 * done)} %`;
   const state = STATES[head.state], seconds = head.time.toFixed(1);
   const time = scene.time_limit ? t("{0} of {1} s", seconds, scene.time_limit.toFixed(0)) : `${seconds} s`;
-  $("time").textContent = state === "ready" ? time : `${time}, ${t(state)}`;
+  $("time").textContent = [time, state === "ready" ? slow : t(state)].filter(Boolean).join(", ");
   if (state === "waiting" && !scene.practice) tell(t(head.time < 0.1 ? "The clock starts with your first movement" : "The clock is stopped; it goes on when you move"));
   else if (waited) tell("");
   waited = state === "waiting" && !scene.practice;
@@ -357,8 +359,8 @@ function report(steps, punctual, share) {
   }
   const now = performance.now(), late = ways.slice(-30).sort((a, b) => a - b);
   const words = [t("{0} steps a second", Math.round(steps)), t("{0} % on time", (100 * punctual).toFixed(1))];
-  const wanted = Number($("speed").value);
-  if (share < 0.95 * wanted) words.push(t("{0} of real time", share.toPrecision(2)));
+  slow = share < 0.95 * Number($("speed").value) ? t("{0} of real time", share.toPrecision(2)) : "";
+  if (slow) words.push(slow);
   words.push(t("{0} pictures a second", pictures.filter(at => now - at < 1000).length));
   if (late.length) words.push(t("hand to picture {0} ms", Math.round(late[late.length >> 1])));
   $("loop").textContent = words.join(", ");

@@ -109,6 +109,11 @@ const GERMAN = {
   "Recording: {0}": "Aufnahme: {0}", "The recording is not in a file yet; it is kept while this page is open.": "Die Aufnahme ist noch in keiner Datei; sie bleibt, solange diese Seite offen ist.",
   // What the program says.
   "Success, after # s": "Geschafft, nach # s", "Failed: the time ran out, after # s": "Nicht geschafft: die Zeit war um, nach # s",
+  "Failed: the needle was dropped, after # s": "Nicht geschafft: die Nadel fiel hinunter, nach # s",
+  "Failed: a hole is too far from its mark, after # s": "Nicht geschafft: ein Stich ist zu weit von seiner Marke, nach # s",
+  "Failed: a stitch came out, after # s": "Nicht geschafft: ein Stich ging auf, nach # s",
+  "Failed: thread broken, after # s": "Nicht geschafft: der Faden ist gerissen, nach # s", "Failed: torn out of the drain, after # s": "Nicht geschafft: aus dem Drain gerissen, nach # s",
+  "Failed: the knot did not hold, after # s": "Nicht geschafft: der Knoten hielt nicht, nach # s", "Failed: a wrong knot, after # s": "Nicht geschafft: ein falscher Knoten, nach # s",
   "Failed: reported a wrong place, after # s": "Nicht geschafft: falsche Stelle gemeldet, nach # s", "Stopped before the end, after # s": "Vor dem Ende beendet, nach # s",
   "Failed: tissue was harmed, after # s": "Nicht geschafft: Gewebe wurde verletzt, nach # s", "Failed: too much force: # N, after # s": "Nicht geschafft: zu viel Kraft: # N, nach # s",
   "Failed: too much force by the shaft: # N, after # s": "Nicht geschafft: zu viel Kraft des Schafts: # N, nach # s",
