@@ -106,7 +106,7 @@ THREAD, EDGE = 0.12, 0.0015  # length of the thread, and of its edges [m]
 _BEAD, _TAIL, _RISE = 0.001, 0.006, 0.003
 FIELD = Scene(
   organ="sheet", instrument="psm", second="psm", port=(-0.06, 0.1, 0.08),
-  second_port=(0.06, 0.1, 0.08), camera=(0.0, 0.075, 0.085), nodes=480,
+  second_port=(0.06, 0.1, 0.08), camera=(0.0, 0.04, 0.105), nodes=480,
 )  # fmt: skip
 _MASS, _SLOTS = 0.004, 160  # of the wall [kg], and of its window
 # Where along the needle's arc, from its middle, the hands hold it [rad].

@@ -193,6 +193,7 @@ def card(recording: Recording, reference: Mapping[str, Any] | None) -> dict[str,
     if math.isfinite(getattr(metrics, name)) and _tells(spec, recording)
   ]
   score_of = result.composite if done and result is not None else math.nan
+  praised = {ADVICE.get(name) for name in judged.good}  # whose advice would contradict
   helps = dict.fromkeys(_help(name, recording) for name in judged.better)
   return {
     "outcome": recording.outcome,
@@ -201,7 +202,7 @@ def card(recording: Recording, reference: Mapping[str, Any] | None) -> dict[str,
     "ending": ending(recording),
     "good": [METRICS[name].label for name in judged.good[:3]],
     "better": [_row(name, recording, known) for name in judged.better[:3]],
-    "helps": [what for what in helps if what][:3],
+    "helps": [what for what in helps if what and what not in praised][:3],
     "moved": bool(metrics.path_length > _STILL),
     "composite": round(score_of, 2) if math.isfinite(score_of) else None,
     "rows": rows,

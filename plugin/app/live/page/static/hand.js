@@ -15,6 +15,7 @@ const ROLL = 0.01;  // [rad]
 const MOST = 0.04;  // in a message [m]
 const DEAD = 0.1;
 const MOVES = "onpointerrawupdate" in window ? "pointerrawupdate" : "pointermove";  // the latter waits for a picture
+const CALM = 0.5;  // share of a hand's speed that the laparoscope's keys have
 const TILTS = 0.2;  // of the camera, half turns a second
 export const CLOCK = 1e6;  // in which the clock of messages goes round [ms]
 
@@ -49,7 +50,7 @@ export class Hand {
     for (const button of pad.querySelectorAll("button")) this.button(button);
   }
 
-  // An exercise begins: the camera is not turned.
+  // An exercise begins, or what follows begins or ends: the camera is not turned.
   begin() {
     this.tilt = 0;  // of the camera, half turns
     this.tilted = performance.now();
@@ -147,7 +148,7 @@ export class Hand {
   // Keys that move the laparoscope.
   view_keys() {
     const rate = [0, 0, 0, 0];
-    for (const name of this.down) if (name in SCOPE) rate[SCOPE[name][0]] += SCOPE[name][1];
+    for (const name of this.down) if (name in SCOPE) rate[SCOPE[name][0]] += CALM * SCOPE[name][1];
     return {rate, held: []};
   }
 

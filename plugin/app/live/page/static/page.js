@@ -444,7 +444,10 @@ toggle("scope", down => {
   hand.scope = down;
   tilts();
 });
-toggle("follow", down => running && say({type: "follow", on: down}));
+toggle("follow", down => {
+  hand.begin();
+  if (running) say({type: "follow", on: down});
+});
 toggle("draw", down => {
   view.pen = down;
   if (down) view.line?.clear();
