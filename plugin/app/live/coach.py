@@ -26,7 +26,7 @@ ADVICE = {
   "shaft_contact": "keep the shaft away from the organ; look at more than the tip",
   "peak_shaft_force": "keep the shaft away from the organ; look at more than the tip",
   "peak_surroundings_force": "go around what is not yours to touch",
-  "time": "plan the next movement during the present one",
+  "time": "be quicker where nothing is touched",
   "path_length": "go straight to the target",
   "path_inefficiency": "go straight to the target",
   "log_dimensionless_jerk": "make one smooth movement in place of several corrections",
@@ -193,7 +193,6 @@ def card(recording: Recording, reference: Mapping[str, Any] | None) -> dict[str,
     if math.isfinite(getattr(metrics, name)) and _tells(spec, recording)
   ]
   score_of = result.composite if done and result is not None else math.nan
-  praised = {ADVICE.get(name) for name in judged.good}  # whose advice would contradict
   helps = dict.fromkeys(_help(name, recording) for name in judged.better)
   return {
     "outcome": recording.outcome,
@@ -202,7 +201,7 @@ def card(recording: Recording, reference: Mapping[str, Any] | None) -> dict[str,
     "ending": ending(recording),
     "good": [METRICS[name].label for name in judged.good[:3]],
     "better": [_row(name, recording, known) for name in judged.better[:3]],
-    "helps": [what for what in helps if what and what not in praised][:3],
+    "helps": [what for what in helps if what][:3],
     "moved": bool(metrics.path_length > _STILL),
     "composite": round(score_of, 2) if math.isfinite(score_of) else None,
     "rows": rows,

@@ -24,7 +24,7 @@ from .devices.device import STILL, Device, DeviceError, Four, Guard, Reading, Th
 _SAME: Four = (1.0, 0.0, 0.0, 0.0)
 _STIRS, _TURNS = 2e-4, 0.005  # of a hand that begins [m], [rad]
 _CLOSE, _OPEN = 2.0, -0.6  # speed of the jaws by button [1/s], and where they grip
-_RETRY = 0.5  # between tries to find a device again [s]
+RETRY = 0.5  # between tries to find a device again [s]
 # Energy that the hand may get before it gives any, and most that is kept account of [J].
 _LENT, _CREDIT = 1e-3, 0.05
 _LIGHTEST = 0.05  # of hands with a device [kg]
@@ -346,7 +346,7 @@ class Link:
     return False
 
   def _find(self, now: float) -> bool:
-    if now - self._tried < _RETRY:
+    if now - self._tried < RETRY:
       return False
     self._tried = now
     try:

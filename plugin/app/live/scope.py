@@ -15,7 +15,8 @@ import numpy as np
 from palpate.models import laparoscope, trocar
 from palpate.models.laparoscope import Pose
 
-from .devices.device import Device, Reading
+from .coupling import RETRY, Options
+from .devices.device import Device, DeviceError, Guard, Reading
 
 DEPTH = 0.08  # from the trocar to the lens where a scene begins [m]
 REACH = (-0.04, 0.12)  # of the insertion from there [m]
@@ -35,6 +36,7 @@ class Scope:
   Attributes:
     device: of the hand that holds it
     follows: whether it keeps the tip in the picture's middle by itself
+    message: what is wrong with the device, for people; empty where nothing is
     pos: of the lens [m]  (3,)
     mat: the picture's axes right, up, back in columns  (3, 3)
   """
@@ -57,7 +59,10 @@ class Scope:
     self._port = laparoscope.behind(pos, mat, DEPTH, optics)
     self._joints = Pose(0.0, 0.0, 0.0, 0.0, 0.0)
     self._tilt = laparoscope.level(mat)  # that the camera is held at [rad]
+    self.message, self._guard = "", Guard(device)
     self._last: Reading | None = None
+    self._heard = math.inf  # when the device last said something [s]
+    self._gone = -math.inf  # when it was last looked for, as it is gone [s]
     self._straying = False
 
   def advance(self, now: float, dt: float, tip: np.ndarray, nodes: np.ndarray) -> bool:
@@ -89,9 +94,33 @@ class Scope:
     head = self._tilt - laparoscope.level(laparoscope.view(self._port, level, self._optics)[1])
     return laparoscope.view(self._port, level._replace(head=head), self._optics)
 
+  def _read(self, now: float) -> Reading | None:
+    """Returns the reading of a device that may be gone, silent, or say what no hand does."""
+    if now - self._gone < RETRY:
+      return None
+    try:
+      if self._gone > -math.inf and not self.device.reopen():
+        self._gone = now
+        return None
+      reading, self._gone = self.device.read(now), -math.inf
+    except DeviceError as error:
+      self.message, self._gone, self._last = str(error), now, None
+      self._guard.forget()
+      return None
+    if reading is None:
+      if now - self._heard > Options.patience:
+        self.message, self._last = f"{self.device.name}: no reading for {Options.patience} s", None
+        self._guard.forget()
+      return None
+    verdict, self._heard = self._guard.check(reading, now), now
+    self.message = "" if verdict == "good" else self._guard.last
+    if verdict == "jump":
+      self._last = None
+    return None if verdict == "bad" else reading
+
   def _hold(self, now: float) -> None:
     """Does what the hand does."""
-    reading, last = self.device.read(now), self._last
+    reading, last = self._read(now), self._last
     if reading is None:
       return
     self._last = reading

@@ -171,6 +171,8 @@ class Session:
     dt = self.env.control_timestep()
     if scope is not None and scope.advance(self.pace.now, dt, physics.tip_pos(), physics.nodes()):
       physics.look_from(np.concatenate([scope.pos, trocar.orientation(scope.mat)]))
+    if scope is not None:
+      self._note(scope.message)
     now = axes(physics.model.ptr, physics.data.ptr)
     if np.abs(now - self._turned).max() > _TURNED:
       self._turned = now
@@ -201,10 +203,14 @@ class Session:
     for hand, link in zip(hands, links, strict=True):
       if ready:
         link.feel(hand.handle.wrench())
-      if link.message and (not self.faults or self.faults[-1] != link.message):
-        self.faults.append(link.message)
+      self._note(link.message)
     if before != [link.state for link in links]:
       self._due = 0.0
+
+  def _note(self, fault: str) -> None:
+    """Notes a fault once."""
+    if fault and (not self.faults or self.faults[-1] != fault):
+      self.faults.append(fault)
 
   def _watch(self, env: Any) -> bool:
     if self.coach is not None:

@@ -1,9 +1,12 @@
 """The laparoscope of a live exercise: held by a hand, following the tip, and recorded."""
 
+import functools
+
 import numpy as np
 import palpate
 import pytest
 from palpate.app import live
+from palpate.app.live.devices.device import DeviceError
 from palpate.app.live.devices.relative import Desk
 from palpate.app.live.scope import Scope
 from palpate.models import laparoscope
@@ -28,6 +31,47 @@ def off(scope, tip):
   """Returns how far a point is from the picture's middle, as a share of half its height."""
   x, y, back = scope.mat.T @ (tip - scope.pos)
   return np.hypot(x, y) / (-back * np.tan(np.radians(25)))
+
+
+class Loose(Desk):
+  """A device that says, at each reading, what a test tells it to."""
+
+  says = None
+
+  def read(self, now):
+    if isinstance(self.says, DeviceError):
+      raise self.says
+    return self.says and self.says(super().read(now))
+
+  def reopen(self):
+    return not isinstance(self.says, DeviceError)
+
+
+def test_a_device_that_fails_is_named_and_the_picture_stays_until_it_is_back():
+  device = Loose("loose")
+  scope, pos = make(device), BACK
+
+  def same(reading, x=0.0):
+    return reading._replace(pos=(x, 0.0, 0.0))
+
+  stages = [
+    (same, ""),
+    (functools.partial(same, x=np.nan), "loose: pose is (nan, 0.0, 0.0), expected finite numbers"),
+    (same, ""),
+    (functools.partial(same, x=50.0), "jumped 50000 mm"),
+    (DeviceError("loose: it is gone"), "loose: it is gone"),
+    (same, ""),
+    (None, "loose: no reading for 0.25 s"),
+    (same, ""),
+  ]
+  for k, (says, told) in enumerate(stages):
+    device.says = says
+    for i in range(60 if says is None or k == 5 else 1):
+      assert not scope.advance(2 * k + STEP * i, STEP, np.zeros(3), NOTHING)
+    assert told in scope.message and bool(told) == bool(scope.message)
+    np.testing.assert_array_equal(scope.pos, pos)
+  device.says = functools.partial(same, x=0.01)
+  assert scope.advance(20.0, STEP, np.zeros(3), NOTHING)
 
 
 def test_it_begins_where_the_picture_was_and_stays():

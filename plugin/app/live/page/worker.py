@@ -418,7 +418,9 @@ def _kwargs(job: dict[str, Any]) -> dict[str, Any]:
 
 def _status(now: Session | Practice) -> dict[str, Any]:
   """Returns the words about what runs."""
-  lost = next((link.message for link in now.links if link.state == "lost"), "")
+  lost = [link.message for link in now.links if link.state == "lost"]
+  lost += [now.scope.message] if now.scope is not None else []
+  lost = next(filter(None, lost), "")
   words = {"type": "status", "instruction": "", "warning": "", "kind": "", "fault": lost}
   if isinstance(now, Practice):
     return words | {"fault": lost or "; ".join(now.faults[-1:]), "scheme": now.organ.integrator}

@@ -168,6 +168,7 @@ const GERMAN = {
   "press and let go gradually": "drücke und löse allmählich", "close the jaws only until they hold": "schließe die Backen nur, bis sie halten",
   "keep the shaft away from the organ; look at more than the tip": "halte den Schaft vom Organ fern; sieh auf mehr als die Spitze", "plan the next movement during the present one": "plane die nächste Bewegung während der jetzigen",
   "go straight to the target": "geh gerade zum Ziel", "make one smooth movement in place of several corrections": "mach eine glatte Bewegung statt mehrerer Korrekturen", "turn the instrument less": "drehe das Instrument weniger",
+  "be quicker where nothing is touched": "sei schneller, wo nichts berührt wird",
   "find the depth first, then go in once": "finde erst die Tiefe, dann geh einmal hinein", "make fewer, longer movements": "mach weniger, längere Bewegungen", "keep the tip in the picture": "halte die Spitze im Bild",
   "keep what is worked on in the middle of the picture": "halte, woran gearbeitet wird, in der Bildmitte", "turn the camera back whenever you roll the scope": "drehe die Kamera zurück, sooft du die Optik drehst",
   "touch only what is asked for": "berühre nur, was verlangt ist", "go around what is not yours to touch": "umgehe, was nicht berührt werden soll", "take more tissue between the jaws before you pull": "nimm mehr Gewebe zwischen die Backen, bevor du ziehst",
