@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
-from palpate.tissue import kernels, step
+from palpate.tissue import step
 from palpate.tissue.body import Body
 
 from . import contacts, coupling, graphs, nodal, penetration
@@ -167,7 +167,7 @@ def _cross(w: Workspace, fields: tuple[str, ...], to_device: bool):
 def load(body: Body):
   """Loads the modules of a step on a body's device, compiling them where the cache has none."""
   there = [*step.kernels(body), nodes.commit]
-  here = [nodal.gather, proxies.gather, contacts.weigh, penetration.find_fast]
-  if body.device.is_cuda:
-    kernels.load(there, body.device)
-  kernels.load(there + here, wp.get_device("cpu"))
+  for kernel in there:
+    kernel.load(body.device)
+  for kernel in (*there, nodal.gather, proxies.gather, contacts.weigh, penetration.find_fast):
+    kernel.load(wp.get_device("cpu"))

@@ -11,10 +11,9 @@ from __future__ import annotations
 import ctypes
 import dataclasses
 import functools
-import os
 import pathlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ import warp as wp
 
 NATIVE = pathlib.Path(__file__).parents[1] / "native"
 # Warp modules of the kernels by kind of device, in the order in which they were declared.
-_AT_ONCE = 4  # modules that are compiled, at most: each takes a core and some 300 MB
 MODULES: dict[str, list[str]] = {"cpu": [], "cuda": []}
 
 
@@ -77,12 +75,6 @@ class Kernel:
     """
     inputs = [1, 0, _reference(self.struct, fields)]
     return wp.launch(self.cpu, dim=(1, 1), inputs=inputs, device="cpu", record_cmd=True)
-
-
-def load(kernels: Iterable[Kernel], device: wp.Device):
-  """Loads the modules of kernels on a device, compiling some at a time where the cache has none."""
-  modules = dict.fromkeys(kernel.on(device).module for kernel in kernels)
-  wp.force_load(device, list(modules), max_workers=min(os.cpu_count() or 1, _AT_ONCE))
 
 
 def aim(fields, **arrays: np.ndarray):

@@ -9,6 +9,7 @@ from palpate.tissue import step
 from ...trainee.keeping import Keeping
 from ...trainee.record import check_name
 
+FIRST = ("touch", "easy")  # exercise, by domain and name
 NODES = (250, 500, 1000, 2000, 4000)  # of an exercise
 SPEEDS = (0.1, 0.25, 0.5, 1.0)
 SCHEMES = tuple(step.SCHEMES)

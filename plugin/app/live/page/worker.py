@@ -19,7 +19,9 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import palpate
+import warp as wp
 from palpate.tasks.recording import Recording
+from palpate.tissue import device as devices
 
 from ...trainee.keeping import Keeping, Kept
 from ..coach import Coach, card
@@ -87,12 +89,14 @@ class Worker:
     self._trace: dict[str, Any] | None = None  # of the expert; empty where it failed
     self._asked = False  # for it
     self._ended = False
+    self._ready = threading.Thread(target=_prepare, daemon=True)
 
   def serve(self) -> None:
     """Works until the end."""
     for target in (self._receive, self._show):
       threading.Thread(target=target, daemon=True).start()
     self._offer()
+    self._ready.start()
     while (job := self._jobs.get()) is not None:
       if not self._jobs.empty():  # something else was asked for since
         continue
@@ -290,6 +294,7 @@ class Worker:
 
     self._sitting.keeping.check(job["task"])
     self._tell({"type": "loading", "text": job["task"], "note": ""})
+    self._ready.join()
     kwargs = _kwargs(job)
     env = suite.load(*suite.split(job["task"]), task_kwargs={"random": 0, **kwargs})
     with self._hands(job["left"], job["scope"]) as (device, other, holder):
@@ -355,6 +360,7 @@ class Worker:
     scene = pathlib.Path(self._scene) if job["organ"] == menu.OWN else None
     text = scene.name if scene else f"{job['organ']}, {job['mesh']}"
     self._tell({"type": "loading", "text": text, "note": note})
+    self._ready.join()
     right, left = job["instrument"], job["left"]
     with self._hands(left, job["scope"]) as (device, other, holder):
       hands = {right: device}
@@ -406,6 +412,17 @@ class Worker:
     own = self._own if registry.on_page(self._own) else "mouse"
     self._desks[which] = desk = Desk(own)
     return desk
+
+
+def _prepare() -> None:
+  """Compiles on a new machine what every exercise needs, while somebody chooses the first one."""
+  from palpate.tasks import suite
+
+  devices.init()
+  compiled = pathlib.Path(wp.config.kernel_cache_dir or "").glob("wp_palpate.cpu.*")
+  if next(compiled, None) is None:
+    with contextlib.suppress(Exception):  # the exercise that is chosen says so
+      suite.load(*menu.FIRST, task_kwargs={"random": 0}).reset()
 
 
 def _kwargs(job: dict[str, Any]) -> dict[str, Any]:
