@@ -20,6 +20,7 @@ import numpy as np
 from palpate.models.handle import Shaft, times
 
 from .devices.device import STILL, Device, DeviceError, Four, Guard, Reading, Three
+from .devices.relative import Desk
 
 _SAME: Four = (1.0, 0.0, 0.0, 0.0)
 _STIRS, _TURNS = 2e-4, 0.005  # of a hand that begins [m], [rad]
@@ -138,6 +139,7 @@ class Link:
       h: step of the loop [s]
     """
     self.device, self.options, self._h = device, options or Options(), h
+    self._time()
     self.guard = Guard(device)
     self.force: Three = STILL
     self.state, self.message = "waiting", ""
@@ -223,8 +225,14 @@ class Link:
     # A library may take its time over it.
     threading.Thread(target=before.close, daemon=True).start()
     self.guard, self.message = Guard(self.device), ""
+    self._time()
     self._hold(self.row[:3], tuple(self.row[3:]))
     self.state = "waiting"
+
+  def _time(self) -> None:
+    """Lets keys and sticks go by the simulation's time, however fast that passes."""
+    if isinstance(self.device, Desk):
+      self.device.step = self._h
 
   # From hand to handle.
 

@@ -17,6 +17,7 @@ from palpate.models.laparoscope import Pose
 
 from .coupling import RETRY, Options
 from .devices.device import Device, DeviceError, Guard, Reading
+from .devices.relative import Desk
 
 DEPTH = 0.08  # from the trocar to the lens where a scene begins [m]
 REACH = (-0.04, 0.12)  # of the insertion from there [m]
@@ -75,6 +76,8 @@ class Scope:
       nodes: of the organ, which the lens keeps away from [m]  (n, 3)
     """
     before = self._joints, self._tilt
+    if isinstance(self.device, Desk):
+      self.device.step = dt
     self._hold(now)
     if self.follows:
       self._follow(dt, tip)

@@ -6,6 +6,7 @@ import numpy as np
 import palpate
 import pytest
 from palpate.app import live
+from palpate.app.live.devices.relative import Desk
 from palpate.tasks import suite
 from palpate.tasks.core import episode
 from palpate.tasks.recording import Recording
@@ -62,6 +63,18 @@ def test_a_hand_without_orientation_leaves_the_shaft_as_it_is_turned():
   made = session(env, live.Hand(lambda t: (0.0, 0.0, 0.0))).run()
   turn = np.abs(made.columns["quat"].reshape(-1, 4) @ made.columns["quat"].reshape(-1, 4)[0])
   assert 2 * np.degrees(np.arccos(np.minimum(turn, 1.0))).max() < 1.0
+
+
+def test_held_keys_go_as_far_in_slow_motion():
+  """A key is 60 mm a second of the simulation's time: the instrument is slow with the rest."""
+  ends = []
+  for speed in (1.0, 0.1):
+    env, desk = load(time_limit=0.3), Desk()
+    desk.feed(rate=(0.0, 1.0, 0.0, 0.0))
+    made = session(env, desk)
+    made.pace.speed = speed
+    ends.append(made.run().column("tip_pos", 0)[-1])
+  np.testing.assert_allclose(*ends, atol=1e-6)
 
 
 def test_stopping_keeps_the_recording_and_lets_go():

@@ -17,13 +17,19 @@ _EVERY = 0.008  # between readings of the hardware [s]
 
 
 class Desk(Silent):
-  """A hand that is moved by what another thread says: displacements, speeds, buttons."""
+  """A hand that is moved by what another thread says: displacements, speeds, buttons.
+
+  Attributes:
+    step: time between readings that speeds are taken for, that of the simulation, which may be
+      slower than the clock; None to take the clock's [s]
+  """
 
   relative = True
 
   def __init__(self, name: str = "desk"):
     """Makes a hand at its origin."""
     self.name = name
+    self.step: float | None = None
     self._lock = threading.Lock()
     self._moved = [0.0] * 4
     self._rate: Sequence[float] = (0.0,) * 4
@@ -63,7 +69,7 @@ class Desk(Silent):
 
   def read(self, now: float) -> Reading:
     """Returns where the hand is."""
-    span = 0.0 if self._time is None else min(now - self._time, 0.1)
+    span = 0.0 if self._time is None else self.step or min(now - self._time, 0.1)
     self._time = now
     with self._lock:
       moved, rate, held, jaw = self._moved, self._rate, self._held, self._jaw

@@ -10,6 +10,13 @@ function make(tag, kind, text = "") {
   return element;
 }
 
+export function picture(task) {
+  const image = new Image();
+  image.src = `cards/${task.replace("/", "_")}.webp`;
+  image.alt = "";
+  return image;
+}
+
 // What was done in this browser, for those without a record: exercise -> "done" or "proficient".
 function known() {
   try {
@@ -50,16 +57,14 @@ export function show(place, menu, start) {
   place.replaceChildren(...groups(menu).map(([name, tasks]) => {
     const row = make("div", "cards"), section = make("section", "domain");
     row.append(...tasks.map(task => {
-      const card = make("button", `card ${states[task]}${task === next ? " next" : ""}`), picture = make("img", "");
+      const card = make("button", `card ${states[task]}${task === next ? " next" : ""}`), shown = picture(task);
       const after = menu.locked[task], mark = {proficient: "★ ", done: "✓ ", locked: "🔒 ", open: ""}[states[task]];
       const tried = menu.progress?.[task]?.tried ? t("{0} of {1} attempts proficient", menu.progress[task].good, menu.progress[task].tried) : "";
       const status = after ? t("after {0}", title(after)) : task === next ? `${mark}${t("next")}` : mark + t(states[task]);
-      picture.src = `cards/${task.replace("/", "_")}.webp`;
-      picture.alt = "";
-      picture.loading = "lazy";
+      shown.loading = "lazy";
       card.dataset.task = task;
       card.disabled = Boolean(after);
-      card.append(picture, make("strong", "", level(task)), make("span", "status", status), make("span", "what", t(menu.tasks[task])), make("span", "tried", tried));
+      card.append(shown, make("strong", "", level(task)), make("span", "status", status), make("span", "what", t(menu.tasks[task])), make("span", "tried", tried));
       card.onclick = () => start(task);
       return card;
     }));

@@ -117,7 +117,7 @@ const HEAR = {
   },
   loading({text, note}) {
     tell("");
-    $("welcome").replaceChildren();
+    $("welcome").replaceChildren(...text in offer.tasks ? [home.picture(text)] : []);
     loading = {text: t(note ? "Loading {0}, which takes a minute or more" : "Loading {0}", offer.tasks[text] ? title(text) : text), since: performance.now()};
     $("instruction").textContent = loading.text;
   },
@@ -230,11 +230,10 @@ function teach() {
 // What is left to a browser that cannot draw: the exercise as a film.
 function without(error) {
   document.body.dataset.mode = "exercise";  // nothing below the import of the view has run
-  const film = document.createElement("code"), picture = new Image(), task = asked.get("task") ?? "touch/easy";
+  const film = document.createElement("code"), task = asked.get("task") ?? "touch/easy";
   film.textContent = `palpate exercise ${task} --film film.mp4`;
-  picture.src = `cards/${task.replace("/", "_")}.webp`;
   $("look").hidden = $("pad").hidden = true;
-  $("welcome").replaceChildren(t("This browser draws no WebGL 2"), picture,
+  $("welcome").replaceChildren(t("This browser draws no WebGL 2"), home.picture(task),
     t("Switch on its hardware acceleration, or try another browser. The exercise as a film, from the command line:"), film);
   console.warn(error);
 }
