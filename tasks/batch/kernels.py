@@ -3,12 +3,11 @@
 import warp as wp
 from palpate.tasks.core import base, jaws, safety
 from palpate.tasks.core.physics import NEAR
-from palpate.tasks.core.rules import closeness as _closeness
 from palpate.tissue.types import Array, floats, ints, struct
 
 from .fields import DAMAGED, RUNNING, SUCCESS, Common
 
-closeness, parts = wp.func(_closeness), wp.func(safety.parts)
+parts = wp.func(safety.parts)
 
 _SHARE, _PRICE = wp.constant(base.SHARE), wp.constant(base.PRICE)
 _MOST = wp.constant(base.MOST)

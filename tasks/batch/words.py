@@ -29,7 +29,7 @@ _POINT = wp.constant(1e-12)  # square of a strand's length that is none, for rou
 WORDS: dict[Any, Any] = {  # of Python -> of Warp
   rules.rows: wp.matrix_from_rows, rules.vector: wp.vec3, rules.length: wp.length,
   rules.dot: wp.dot, rules.root: wp.sqrt, rules.angle: wp.atan2, rules.sine: wp.sin,
-  rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
+  rules.clamp: wp.clamp,
 }  # fmt: skip
 
 
@@ -67,11 +67,6 @@ def peak(s: Common):
 @word
 def tissue_force(s: Common):
   return kernels.vector(s.tissue_force, s.world)
-
-
-@word
-def force(s: Common):
-  return wp.length(tissue_force(s))
 
 
 @word
