@@ -445,9 +445,8 @@ PALPATE void follow_thread(const Fields& f, int i, const Arc& arc, double* s, in
   place -= off > 0.0 ? off - slack : off + slack;
   const double whole = thread.length();
   place = place < whole ? place : whole;
-  if (place > 0.0) return;  // else on the needle again, if that is there
-  const double there = arc.nearest(p);
-  if (norm(arc.place(there < 0.0 ? 0.0 : there) - p) < thread.edge(0)) place = hole(s, n)[HOLE_SLIP] = 0.0;
+  if (place > 0.0) return;  // else on the needle again, where that is still at its end
+  if (norm(arc.place(0.0) - thread.at(0)) < thread.edge(0)) place = hole(s, n)[HOLE_SLIP] = 0.0;
   else place = 2.0 * thread.length();
 }
 
