@@ -22,6 +22,9 @@ _NEAR = 1e-4  # from the swage to the first node of a thread [m]
 # What joins a thread: MuJoCo's equalities are as firm as what they hold is heavy, unless their
 # impedance is near to 1.
 _FIRM = {"solref": (0.005, 1.0), "solimp": (0.999, 0.9999, 0.001, 0.5, 2.0)}
+# Inertia of turning that a free needle has besides its own, over m r^2. A needle that slips out of
+# jaws spins by a radian a step, and MuJoCo's explicit gyroscopic forces would spin it up for ever.
+_ARMATURE = 2.0
 _RGBA = (0.75, 0.77, 0.8, 1.0)
 
 
@@ -93,8 +96,8 @@ def add_needle(
   if thread is not None:
     _check_thread(spec, name, thread, _place(where, pos, quat, points[0]), length)
   body = where.add_body(name=name, pos=pos, quat=quat)
-  if parent is None:
-    body.add_freejoint(name=name)
+  if parent is None:  # as inertia about all axes: as mass it is nothing
+    body.add_freejoint(name=name).armature = _ARMATURE * mass * circle**2
   _draw(spec, body, circle, angle, 0.5 * diameter, rgba)
   look = {"condim": 4, "friction": (1.0, 0.005, 0.0001)} | dict(contact or {})
   for k in range(_CAPSULES):
