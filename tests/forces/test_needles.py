@@ -523,6 +523,93 @@ def test_a_needle_that_is_levered_sideways_tears_the_sheet():
   assert organ.needles[0].energy - energy == pytest.approx(bears * torn[-1], rel=0.02)
 
 
+def grips(spec, names):
+  """Adds pairs of jaws beside the scene, each carried by a mocap body on a spring of 3 kN/m."""
+  for k, name in enumerate(names):
+    pos = (0.1, 0.1 * k, 0)
+    spec.worldbody.add_body(name=f"{name}_to", mocap=True, pos=pos)
+    body = spec.worldbody.add_body(name=name, pos=pos)
+    body.add_freejoint(name=name)
+    body.add_geom(size=[0.002] * 3, mass=0.2, contype=0, conaffinity=0)
+    spec.add_equality(
+      type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=f"{name}_to",
+      name2=name, solref=[0.008, 1],
+    )  # fmt: skip
+    for side in (-1, 1):
+      jaw, joint = body.add_body(pos=(side * 0.0012, 0, 0)), f"{name}{side}"
+      jaw.add_joint(
+        name=joint, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-side, 0, 0], armature=2, damping=20
+      )
+      jaw.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX, size=[7e-4, 1.3e-3, 3.6e-3], mass=1e-3, condim=6,
+        friction=[1, 0.001, 3e-4], solref=[0.002, 1], solimp=[0.9999, 0.9999, 0.001, 0.5, 2],
+        solmix=1000, contype=2, conaffinity=2,
+      )  # fmt: skip
+      motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+      motor.set_to_motor()
+  for geom in spec.body("needle").geoms:
+    if geom.contype:
+      geom.contype = geom.conaffinity = 3
+
+
+def pulled_apart(model, data, organ, ways, seconds, speed=0.05):
+  """Holds a driven needle by two grips of 15 N, and moves them against each other to and fro.
+
+  Yields the needle and its velocity [m/s] at each step.
+  """
+  place, turn = data.body("needle").xpos, data.body("needle").xmat.reshape(3, 3)
+  targets = []
+  for name, angle in zip("ab", np.radians((-60.0, 56.0)), strict=True):
+    radial = np.cos(angle) * turn[:, 0] + np.sin(angle) * turn[:, 1]
+    quat = np.zeros(4)
+    mat = np.column_stack([radial, np.cross(turn[:, 2], radial), turn[:, 2]])
+    mujoco.mju_mat2Quat(quat, mat.ravel())
+    data.joint(name).qpos[:] = *(place + RADIUS * radial), *quat
+    target = model.body(f"{name}_to").mocapid[0]
+    data.mocap_pos[target], data.mocap_quat[target] = data.joint(name).qpos[:3], quat
+    targets.append((target, data.mocap_pos[target].copy()))
+    for side in (-1, 1):
+      data.actuator(f"{name}{side}").ctrl[0] = 15.0
+  mujoco.mj_step(model, data, 60)
+  data.eq_active[model.equality("grip").id] = 0
+  for way in ways:
+    for k in range(round(seconds / STEP)):
+      far = 0.008 * np.sin(speed / 0.008 * k * STEP)
+      for (target, start), sign in zip(targets, (1, -1), strict=True):
+        data.mocap_pos[target] = start + sign * far * np.array(way)
+      mujoco.mj_step(model, data)
+      yield organ.needles[0], np.linalg.norm(data.joint("needle").qvel[:3])
+
+
+@pytest.mark.parametrize("solid", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_two_grips_that_pull_against_each_other_tear_what_they_hold_and_throw_nothing(solid):
+  """Forces stay those of tearing, and the motion that of the hands: along the plane, across and up.
+
+  In a step in which a hole is made or the needle goes fast its spring may bear more.
+  """
+  spec = scene(solid=solid, free=True, height=0.0175 if solid else None)
+  grips(spec, "ab")
+  spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 100
+  spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+  spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
+  spec.option.tolerance = 1e-12
+  model, data, organ = load(spec)
+  drive(model, data, organ, [2.9 if solid else 2.2], speed=6.0)
+  holes, torn, bears = len(organ.needles[0].holes), [0.0], []
+  ways = np.eye(3)[[1, 0, 2] if solid else [2]]
+  for now, speed in pulled_apart(model, data, organ, ways, 0.7):
+    assert speed < 0.5
+    torn.append(max((hole.torn for hole in now.holes), default=0.0))
+    bears.append(max((np.linalg.norm(hole.force) for hole in now.holes), default=0.0))
+  assert np.isfinite(data.qpos).all() and not data.warning.number.any()
+  assert organ.error is None
+  assert max(torn) > 5e-4 or len(organ.needles[0].holes) < holes
+  most = 300 * SLIT if solid else ENERGY * THICK  # what the surface bears, or the wall
+  assert max(bears) < 2 * most
+  if not solid:
+    assert np.median(np.array(bears)[np.diff(torn) > 0]) == pytest.approx(most, rel=0.2)
+
+
 def tears_at(model, data, organ, ends, most):
   """Pulls at nodes by rising forces [N]; returns pinholes as they were before the first tore."""
   before = organ.pinholes

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
+from palpate.models import wrist
 from palpate.tasks import suite
 from palpate.tasks.core import episode, performer, stage
 from palpate.tasks.domains import running
@@ -79,6 +80,30 @@ def test_what_does_not_count(easy, monkeypatch, changed, outcome):
   for name, value in changed.items():
     monkeypatch.setattr(easy.task, name, value)
   assert running.advance(easy.physics, easy.task)[2] == outcome
+
+
+@pytest.mark.slow
+def test_hands_that_pull_a_needle_in_the_wall_against_each_other_throw_nothing(easy):
+  """Each by 12 mm along an axis, at 20 mm/s, once both hold it."""
+  timestep, task, physics = easy.reset(), easy.task, easy.physics
+  act = performer.make(easy, seed=0)
+  while not (task.left_holds and task.right_holds):
+    timestep = easy.step(act(timestep))
+  model, data, begun = physics.model.ptr, physics.data.ptr, physics.integration_state()
+  for way in (*np.eye(3), *-np.eye(3)):
+    physics.place(begun)
+    held = [wrist.forward(hand.trocar(), hand.drive_targets()) for hand in physics.hands]
+    for k in range(1200):
+      far = min(2e-5 * k, 0.012)
+      for hand, (pos, turn), side in zip(physics.hands, held, (1, -1), strict=True):
+        roll = float(hand.drive_targets()[2])
+        data.ctrl[hand.drives] = wrist.inverse(hand.trocar(), pos + side * far * way, turn, roll)
+      mujoco.mj_step(model, data)
+      now = physics.organ.needles[0]
+      assert np.linalg.norm(now.force) < task.damage / 2
+      assert np.linalg.norm(data.joint("needle").qvel[:3]) < 0.5
+    assert not data.warning.number.any() and physics.organ.error is None
+    assert len(now.holes) >= 6  # those of the thread; the needle may be drawn out, or go in again
 
 
 @pytest.mark.slow
