@@ -140,7 +140,14 @@ class Needlework(Task):
         geom.contype, geom.conaffinity = geom.contype | MEETS, geom.conaffinity | MEETS
 
   def take_up(
-    self, physics: Any, pose: Pose, angle: float, lean: float, along: float, side: float = 1.0
+    self,
+    physics: Any,
+    pose: Pose,
+    angle: float,
+    lean: float,
+    along: float,
+    side: float = 1.0,
+    tilt: float = 0.0,
   ) -> np.ndarray:
     """Puts the needle into the right hand's jaws, as an episode begins.
 
@@ -151,6 +158,7 @@ class Needlework(Task):
       lean: most that it is turned about each axis of the world, drawn [rad]
       along: most that the jaws are off the angle, drawn [rad]
       side: 1 where the jaws point against the circle's axis, -1 along it
+      tilt: see `grasp`
 
     Returns:
       Where its tip is [m]  (3,).
@@ -160,7 +168,8 @@ class Needlework(Task):
     mat = about(0, turned[0]) @ about(1, turned[1]) @ about(2, turned[2]) @ mat
     angle = angle + self.random.uniform(-along, along)
     port = physics.trocar()
-    physics.set_joints(wrist.inverse(port, *grasp(port, place, mat * (1, 1, side), angle)))
+    held = grasp(port, place, mat * (1, 1, side), angle, tilt=tilt)
+    physics.set_joints(wrist.inverse(port, *held))
     self.joints = {"needle": np.concatenate([place, trocar.orientation(mat)])}
     self.joints |= {f"{self.prefix}jaw_{side}": np.array([_OPENING]) for side in ("left", "right")}
     self.right_holds, self.left_holds, self.loose, self.regrasps = 1.0, 0.0, 0.0, 0.0
@@ -217,16 +226,24 @@ def needle(physics: Any) -> Pose:
 
 
 def grasp(
-  port: Any, pos: np.ndarray, mat: np.ndarray, angle: float, like: np.ndarray | None = None
+  port: Any,
+  pos: np.ndarray,
+  mat: np.ndarray,
+  angle: float,
+  like: np.ndarray | None = None,
+  tilt: float = 0.0,
 ) -> Pose:
   """Returns the tip's pose that has the needle across the jaws at an angle along its arc [rad].
 
-  Of the two ways round it is the one that turns the shaft less, from a pose or from zero.
+  Of the two ways round it is the one that turns the shaft less, from a pose or from zero. Jaws may
+  be tilted by an angle in their plane, their back towards the needle's tip [rad].
   """
   radial = math.cos(angle) * mat[:, 0] + math.sin(angle) * mat[:, 1]
-  place = pos + RADIUS * radial - _BITE * mat[:, 2]
-  across = np.cross(mat[:, 2], radial)
-  ways = [np.column_stack([s * radial, s * across, mat[:, 2]]) for s in (1, -1)]
+  along = math.cos(angle) * mat[:, 1] - math.sin(angle) * mat[:, 0]
+  back = math.cos(tilt) * mat[:, 2] + math.sin(tilt) * along
+  place = pos + RADIUS * radial - _BITE * back
+  across = np.cross(back, radial)
+  ways = [np.column_stack([s * radial, s * across, back]) for s in (1, -1)]
   roll = 0.0 if like is None else float(wrist.inverse(port, place, like)[2])
   turned = [abs(float(wrist.inverse(port, place, turn)[2]) - roll) for turn in ways]
   return place, ways[int(np.argmin(turned))]

@@ -109,13 +109,15 @@ FIELD = Scene(
   second_port=(0.06, 0.1, 0.08), camera=(0.0, 0.04, 0.105), nodes=480,
 )  # fmt: skip
 _MASS, _SLOTS = 0.004, 160  # of the wall [kg], and of its window
-# Where along the needle's arc, from its middle, the hands hold it [rad].
-_RIGHT, _LEFT = math.radians(-72.0), math.radians(70.0)
+# Where along the needle's arc, from its middle, the hands hold it, short of its taper, and how
+# their jaws are tilted, off the wall [rad].
+_RIGHT, _LEFT = (math.radians(-72.0), math.radians(-30.0)), (math.radians(58.0), math.radians(30.0))
 # Of the expert: the angle of the tip that comes out at which it is taken, as high as the other hand
 # then is [rad], how high the needle is brought over the wall, how far a hand goes back and up [m],
 # and what it pulls with [N].
 _OUT, _HIGH, _BACK, _UP, _PULL = math.radians(92.5), 0.012, 0.01, 0.008, 0.7
 _MORE = 0.02  # how the pull grows [N/s]
+_LITTLE, _DRAWN = 0.01, 0.03  # slack that is drawn in with care [m], and how fast more is [m/s]
 # How far it turns at once [rad], how high it is handed over [m], tension of a thread without slack
 # [N], and which way it is pulled.
 _LOOK, _OVER, _TAUT, _WAY = 0.6, 0.02, 0.3, np.array([0.6, 0.35, 0.72])
@@ -351,8 +353,10 @@ class Running(Stitching):
     self.closed = self.through = self.stitches = self.pierced = 0.0
     self.target, self.way, self.circle, self.middle = np.zeros((4, 3))
     self.gap = self.gap0 = widest(physics, self)
-    tip = self.take_up(physics, self.held, _RIGHT, lean=0.0, along=0.08, side=-1.0)
+    angle, tilt = _RIGHT
+    tip = self.take_up(physics, self.held, angle, lean=0.0, along=0.08, side=-1.0, tilt=tilt)
     self.start0 = float(np.linalg.norm(tip - place(physics, self, first)))
+    self.aims = -1, np.zeros((2, 3))  # of the expert, see `_ends`
     _, second = physics.hands
     port, aside = second.trocar(), self.random.uniform(-0.005, 0.005, 3)
     pos, turn = park(port)
@@ -396,18 +400,23 @@ class Running(Stitching):
         yield from one(p, p.other, _let_go(p.other))
       elif self.left_holds:
         yield from one(p, p.other, self._hand(p.other))
-        yield from one(p, p, self._take(p, _RIGHT))
+        yield from one(p, p, self._take(p, *_RIGHT))
       elif self.right_holds and out and self._angle(p) > _OUT - 0.1:
-        yield from one(p, p.other, self._take(p.other, _LEFT))
+        yield from one(p, p.other, self._take(p.other, *_LEFT))
       elif self.right_holds:
         yield from one(p, p, self._drive(p))
       else:
         yield from p.wait(0.1)
 
-  def _ends(self, p: Performer, first: int | None = None) -> np.ndarray:
-    """Returns where the marks of a stitch are, of that whose turn it is [m]  (2, 3)."""
-    first = now(self) if first is None else first
-    return np.array([place(p.physics, self, first + k) for k in range(2)])
+  def _ends(self, p: Performer) -> np.ndarray:
+    """Returns where the marks of the stitch are whose turn it is [m]  (2, 3).
+
+    They are those before the needle is in: a hand that followed the wall would draw it along.
+    """
+    first = now(self)
+    if self.holes <= first or self.aims[0] != first:
+      self.aims = first, np.array([place(p.physics, self, first + k) for k in range(2)])
+    return self.aims[1]
 
   def _angle(self, p: Performer) -> float:
     """Returns the angle of the needle's tip, see `piercing`."""
@@ -415,11 +424,11 @@ class Running(Stitching):
 
   def _turn(self, p: Performer, end: float) -> Script:
     """Turns the needle on about its circle; looks how the needle lies in the jaws meanwhile."""
-    start, first = self._angle(p), now(self)  # which may be another when the thread follows
+    start, ends = self._angle(p), self._ends(p)
     stop = min(start + _LOOK, end)
 
     def way(t: float) -> Pose:
-      return piercing(self._ends(p, first), start + t * (stop - start))
+      return piercing(ends, start + t * (stop - start))
 
     yield from carry(p, way, stop - start)
     yield from arrive(p)
@@ -433,14 +442,14 @@ class Running(Stitching):
       yield from arrive(p)
       yield from carry(p, lambda t: (pos, mat))
       yield from arrive(p)
-    while self._angle(p) < _OUT - 0.02:
-      yield from self._turn(p, _OUT)
+    while self.holes < 2 * self.done + 2 or self._angle(p) < _OUT - 0.02:
+      yield from self._turn(p, max(_OUT, self._angle(p) + 0.2))
 
-  def _take(self, p: Performer, angle: float) -> Script:
-    """Takes the needle from behind, at an angle along its arc."""
+  def _take(self, p: Performer, angle: float, tilt: float) -> Script:
+    """Takes the needle from behind, at an angle along its arc, with tilted jaws."""
     p.extra[:] = WIDE
     pos, mat = needle(p.physics)
-    goal, turn = grasp(p.trocar, pos, mat * (1, 1, -1), angle, p.turn)
+    goal, turn = grasp(p.trocar, pos, mat * (1, 1, -1), angle, p.turn, tilt)
     yield from move_tip(p, goal + _away(turn), turn)
     yield from arrive(p)
     yield from move_tip(p, goal, turn)
@@ -466,13 +475,20 @@ class Running(Stitching):
     yield from arrive(p)
 
   def _pull(self, p: Performer, enough: Callable[[], bool]) -> Script:
-    """Pulls at the thread until that is enough."""
+    """Draws the thread through until it has little slack, and pulls at it until that is enough."""
     most = _PULL * self.tension / TENSION * p.style.force
     while not enough():
       most += _MORE * p.dt  # nobody stops short of what is wanted
-      speed = float(np.clip(0.05 * (most - self.tight), -0.01, 0.025))
-      p.tip = p.tip + p.care * speed * p.dt * _WAY
+      careful = p.care * float(np.clip(0.05 * (most - self.tight), -0.01, 0.025))
+      speed = _DRAWN * p.style.speed if self._slack(p.physics) > _LITTLE else careful
+      p.tip = p.tip + speed * p.dt * _WAY
       yield p.step()
+
+  def _slack(self, physics: Any) -> float:
+    """Returns how much longer the thread is from its first hole to the needle than the way [m]."""
+    holes = physics.organ.needles[0].holes
+    way = np.array([*(hole.at for hole in holes), arc(physics, 0.0)])
+    return -holes[0].along - _along(way) if holes else 0.0
 
 
 def _seats(rest: np.ndarray, elem: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
