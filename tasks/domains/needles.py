@@ -165,7 +165,8 @@ class Needlework(Task):
     """
     place, mat = pose
     turned = self.random.uniform(-lean, lean, 3)
-    mat = about(0, turned[0]) @ about(1, turned[1]) @ about(2, turned[2]) @ mat
+    for axis in (2, 1, 0):
+      mat = trocar.about(axis, turned[axis]) @ mat
     angle = angle + self.random.uniform(-along, along)
     port = physics.trocar()
     held = grasp(port, place, mat * (1, 1, side), angle, tilt=tilt)
@@ -247,13 +248,6 @@ def grasp(
   roll = 0.0 if like is None else float(wrist.inverse(port, place, like)[2])
   turned = [abs(float(wrist.inverse(port, place, turn)[2]) - roll) for turn in ways]
   return place, ways[int(np.argmin(turned))]
-
-
-def about(axis: int, angle: float) -> np.ndarray:
-  """Returns the rotation about an axis by an angle [rad]."""
-  quat = np.zeros(4)
-  mujoco.mju_axisAngle2Quat(quat, np.eye(3)[axis], angle)
-  return matrix(quat)
 
 
 def between(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:

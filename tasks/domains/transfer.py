@@ -28,7 +28,7 @@ import mujoco
 import numpy as np
 import palpate
 import warp as wp
-from palpate.models import wrist
+from palpate.models import trocar, wrist
 from palpate.tissue.types import Array
 
 from ..core.base import Physics
@@ -63,7 +63,6 @@ from .needles import (
   Hands,
   Needlework,
   Pose,
-  about,
   apart,
   arc,
   away,
@@ -423,7 +422,7 @@ def park(task: Transfer, port: Any, middle: np.ndarray) -> Pose:
   """Returns a pose of a tip beside the rings, on the side of its trocar, jaws down."""
   aside = math.copysign(0.03, port.pos[0] - middle[0])
   turn = port.mat.copy()
-  return middle + np.array([aside, 0.0, 0.02]), turn @ about(2, -QUARTER)
+  return middle + np.array([aside, 0.0, 0.02]), turn @ trocar.about(2, -QUARTER)
 
 
 def _let_go(task: Transfer, p: Performer) -> Script:
