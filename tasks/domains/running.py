@@ -7,8 +7,7 @@ the left one takes its tip and draws needle and thread through. After the last o
 pulled until the gap is under a millimetre, and held so for half a second: no knot is tied.
 
 The thread meets the wall in its holes alone, and it floats: there is no gravity. The lips of the
-cut do not touch each other. Hands that grip a needle in the wall against each other can throw it,
-with forces of tens of newtons: such an episode ends as damage.
+cut do not touch each other.
 
 Own observations, in the world: `target` (3,), from the needle's tip to the mark whose turn it is
 [m]; `way` (3,), from the mark of the way in to that of the way out [-]; `circle` (3,), axis of the
