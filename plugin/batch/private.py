@@ -13,6 +13,7 @@ from mujoco_warp._src.support import jac_dof
 from mujoco_warp._src.types import (
   MJ_MAX_EPAFACES,
   MJ_MAX_EPAHORIZON,
+  ConstraintState,
   ConstraintType,
   ContactType,
   DeterminismType,
@@ -22,7 +23,7 @@ from mujoco_warp._src.types import (
 )
 
 __all__ = [
-  "MJ_MAX_EPAFACES", "MJ_MAX_EPAHORIZON", "ConstraintType", "ContactType", "DeterminismType",
-  "Geom", "GeomType", "OverflowType", "box_triangle", "capsule_triangle", "ccd", "contact_kbimp",
-  "jac_dof", "passive", "sensor", "solver", "sphere_triangle", "vec5",
+  "MJ_MAX_EPAFACES", "MJ_MAX_EPAHORIZON", "ConstraintState", "ConstraintType", "ContactType",
+  "DeterminismType", "Geom", "GeomType", "OverflowType", "box_triangle", "capsule_triangle", "ccd",
+  "contact_kbimp", "jac_dof", "passive", "sensor", "solver", "sphere_triangle", "vec5",
 ]  # fmt: skip

@@ -137,7 +137,8 @@ class Worlds(Batch):
     between = _CONTACTS if strip_organs.tools_meet(bare) else 0
     self.njmax = strip_organs.rows_of(bare) + (between + sum(most)) * each
     ncon = between + sum(most)
-    size = states.bytes_of(bare, self.njmax, ncon) + sum(
+    times = 3 if deterministic else 1  # rows are kept, and spread over all dofs
+    size = states.bytes_of(bare, times * self.njmax, ncon) + sum(
       Organ.bytes_of(w, self.device) for w in spaces.values()
     )
     size += sum(map(rods.bytes_of, sewn))

@@ -10,7 +10,6 @@ from palpate.batch.contact.fixed_order import FixedOrder, is_enough, sort_matche
 from scenes import probed
 
 ROWS = ("type", "id", "J_rownnz", "J_rowadr", "pos", "margin", "D", "vel", "aref", "frictionloss")
-BLOCKS = ("jtdaj_adr", "jtdaj_nrow")
 
 
 def pressed(device):
@@ -29,7 +28,7 @@ def shuffle(batch, random):
   efc, contact = batch.d.efc, batch.d.contact
   count, adr = batch.d.nefc.numpy(), contact.efc_address.numpy().copy()
   arrays = {name: getattr(efc, name).numpy().copy() for name in ROWS}
-  blocks = efc.jtdaj_adr.numpy().copy(), efc.jtdaj_nrow.numpy().copy()
+  blocks = efc.jtdaj_adr.numpy(), efc.jtdaj_nrow.numpy()
   for w in range(batch.nworld):
     n, number = int(count[w]), int(efc.jtdaj_nblock.numpy()[w])
     own = {first: k for k, first in enumerate(blocks[0][w, :number])}
@@ -43,23 +42,18 @@ def shuffle(batch, random):
     mine = np.flatnonzero((contact.worldid.numpy() == w) & (adr[:, 0] >= 0))
     mine = mine[mine < batch.d.nacon.numpy()[0]]
     adr[mine] = np.where(adr[mine] >= 0, place[np.maximum(adr[mine], 0)], -1)
-    nrow = [blocks[1][w, own[first]] for first in mixed]
-    blocks[0][w, :number], blocks[1][w, :number] = np.cumsum([0, *nrow])[:-1], nrow
   for name, values in arrays.items():
     getattr(efc, name).assign(values)
-  efc.jtdaj_adr.assign(blocks[0])
-  efc.jtdaj_nrow.assign(blocks[1])
   contact.efc_address.assign(adr)
 
 
 def rows(batch):
-  """Returns what rows there are, which contacts have them, and their blocks."""
+  """Returns what rows there are, and which contacts have them."""
   efc, contact = batch.d.efc, batch.d.contact
   found = {"address": [contact.efc_address.numpy()[: batch.d.nacon.numpy()[0]].copy()]}
-  for names, counts in ((ROWS, batch.d.nefc), (BLOCKS, efc.jtdaj_nblock)):
-    for name in names:
-      worlds = zip(getattr(efc, name).numpy(), counts.numpy(), strict=True)
-      found[name] = [values[:n].copy() for values, n in worlds]
+  for name in ROWS:
+    worlds = zip(getattr(efc, name).numpy(), batch.d.nefc.numpy(), strict=True)
+    found[name] = [values[:n].copy() for values, n in worlds]
   return found
 
 

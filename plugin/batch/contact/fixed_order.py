@@ -2,8 +2,9 @@
 
 mujoco_warp's threads ask for contacts and constraint rows, which are placed as they come, and add
 up over them by atomics. Here contacts and rows are put in an order that depends on the state alone,
-and the few sums over them are taken in it. Warp's own deterministic mode, which mujoco_warp has for
-all of its sums, writes down every addend of every kernel and sorts them all.
+and the few sums over them are taken in it: J^T f and J^T D J of rows that are spread over all dofs,
+the latter by tiles of the matrix. Warp's own deterministic mode, which mujoco_warp has for all of
+its sums, writes down every addend of every kernel and sorts them all.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -22,31 +23,28 @@ import warp as wp
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
 from .. import private
-from ..private import ConstraintType
+from ..private import ConstraintState, ConstraintType, vec5
 
 # Columns of mujoco_warp's rows that move with them.
-_INTS = ("type", "id", "J_rownnz", "J_rowadr")
-_FLOATS = ("pos", "margin", "D", "vel", "aref", "frictionloss")
+_COLUMNS = ("type", "id", "J_rownnz", "J_rowadr", "pos", "margin", "D", "vel", "aref",
+            "frictionloss")  # fmt: skip
+_TYPE, _ID, _ROWNNZ, _ROWADR = (wp.constant(k) for k in range(4))
 _CONTACT = wp.constant(int(ConstraintType.CONTACT_FRICTIONLESS))  # and what comes after it
 _FRICTION = wp.constant(int(ConstraintType.FRICTION_DOF))
 _PAIR = wp.constant(64)  # contacts of two geoms, at most
 # Contacts of a world's geoms that are put in order; more stay as they came.
 _ROOM = wp.constant(64)
-_LANES = wp.constant(16)  # threads of a world that add up what rows do to dofs
+_TILE = wp.constant(16)  # dofs and rows of a tile of the Hessian, which share out a row
+_ROWS = wp.constant(32)  # of a world that are worked on at once
+_CONE = wp.constant(int(ConstraintState.CONE))
+_QUADRATIC = wp.constant(int(ConstraintState.QUADRATIC))
 
 
 @struct
-class Ints:
-  """A column of all rows, or one of all contacts in words of 32 bits."""
+class Column:
+  """A column of all rows, or of all contacts, in words of 32 bits."""
 
-  column: ints("nworld", "njmax")
-
-
-@struct
-class Floats:
-  """The same of numbers."""
-
-  column: floats("nworld", "njmax")
+  words: ints("nworld", "njmax")
 
 
 @struct
@@ -58,12 +56,12 @@ class Pairs:
   geom: Array(wp.vec2i, ("naconmax",))
   number: ints("naconmax")  # among those of two geoms
   worldid: ints("naconmax")
-  moved: Array(Ints, ("ncolumn",))  # what moves
+  moved: Array(Column, ("ncolumn",))  # what moves
   count: ints("nworld")  # contacts of a world
   before: ints("nworld")  # those of the worlds before it
   listed: ints("nworld", _ROOM)  # as they came
   place: ints("naconmax")  # where one goes among those of its world
-  kept: ints("nword", "naconmax")  # what is moved
+  kept: Array(Column, ("ncolumn",))  # of what is moved
 
 
 @struct
@@ -71,21 +69,23 @@ class Rows:
   """The constraint rows of mujoco_warp, and room to put them in order."""
 
   nefc: ints("nworld")
-  nblock: ints("nworld")  # blocks of rows that share their dofs
-  block_adr: ints("nworld", "njmax")  # their first row
-  block_nrow: ints("nworld", "njmax")
   type: ints("nworld", "njmax")
   id: ints("nworld", "njmax")  # of the joint, the contact, ...
-  moved: Array(Ints, ("nint",))  # what moves: `_INTS`, and `part`
-  moved_float: Array(Floats, ("nfloat",))
+  moved: Array(Column, ("ncolumn",))  # what moves: `_COLUMNS`
   frictionadr: ints("nworld", "nv")  # row of a dof's friction
   contact_row: ints("naconmax", "nrow")
-  key: Array(wp.int64, ("nworld", "njmax"))  # what rows are ordered by
   part: ints("nworld", "njmax")  # which of its contact's rows
-  place: ints("nworld", "njmax")  # where a row goes
-  kept: ints("nint", "nworld", "njmax")  # what is moved
-  kept_float: floats("nfloat", "nworld", "njmax")
-  kept_block: ints(2, "nworld", "njmax")
+  kept: Array(Column, ("ncolumn",))  # of what is moved
+  # What sums over them need:
+  friction: Array(vec5, ("naconmax",))
+  impratio_invsqrt: floats("nworld")
+  D: floats("nworld", "njmax")
+  state: ints("nworld", "njmax")
+  force: floats("nworld", "njmax")
+  colind: ints("nworld", 1, "njmax_nnz")
+  J: floats("nworld", 1, "njmax_nnz")
+  whole: floats("nworld", "nrow", "ncolumn")  # J, of whole tiles
+  weighed: floats("nworld", "nrow", "ncolumn")  # D J, or the curvature of a cone times J
 
 
 @wp.func
@@ -130,31 +130,25 @@ def _place_contacts(p: Pairs):
 
 @wp.kernel(enable_backward=False)
 def _keep_contacts(p: Pairs):
-  """Keeps contacts at their places."""
-  c = wp.tid()
+  """Keeps contacts at their places, a thread a column."""
+  c, f = wp.tid()
   if c >= _found(p):
     return
   to = p.before[p.worldid[c]] + p.place[c]
-  word = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-  for f in range(p.moved.shape[0]):
-    column = p.moved[f].column
-    for k in range(column.shape[1]):
-      p.kept[word, to] = column[c, k]
-      word += 1
+  column, kept = p.moved[f].words, p.kept[f].words
+  for k in range(column.shape[1]):
+    kept[to, k] = column[c, k]
 
 
 @wp.kernel(enable_backward=False)
 def _move_contacts(p: Pairs):
-  """Moves contacts to their places."""
-  c = wp.tid()
+  """Moves contacts to their places, a thread a column."""
+  c, f = wp.tid()
   if c >= _found(p):
     return
-  word = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-  for f in range(p.moved.shape[0]):
-    column = p.moved[f].column
-    for k in range(column.shape[1]):
-      column[c, k] = p.kept[word, c]
-      word += 1
+  column, kept = p.moved[f].words, p.kept[f].words
+  for k in range(column.shape[1]):
+    column[c, k] = kept[c, k]
 
 
 @wp.func
@@ -162,122 +156,174 @@ def _count(r: Rows, w: int):
   return wp.min(r.nefc[w], r.type.shape[1])
 
 
-@wp.kernel(enable_backward=False)
-def _find_keys(r: Rows):
-  """Finds what rows are ordered by: the kind of constraint, and its number."""
-  w, k = wp.tid()
-  if k >= _count(r, w):
-    return
-  part = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-  if r.type[w, k] >= _CONTACT:
-    part = k - r.contact_row[r.id[w, k], 0]
-  r.key[w, k] = wp.int64(r.id[w, k]) + (wp.int64(r.type[w, k]) << wp.int64(48))
-  r.part[w, k] = part
+@wp.func
+def _row_key(r: Rows, w: int, k: int):
+  """Returns what rows are ordered by: the kind of constraint, and its number."""
+  return wp.int64(r.id[w, k]) + (wp.int64(r.type[w, k]) << wp.int64(32))
 
 
 @wp.kernel(enable_backward=False)
 def _keep(r: Rows):
-  """Finds where rows go, and keeps them."""
+  """Finds where rows go, and keeps them; those of one constraint stay in their order."""
   w, k = wp.tid()
   n = _count(r, w)
   if k >= n:
     return
-  key = r.key[w, k]
+  key = _row_key(r, w, k)
   to = int(0)  # noqa: RUF046, UP018 - a variable to Warp
   for q in range(n):
-    other = r.key[w, q]
+    other = _row_key(r, w, q)
     if other < key or (other == key and q < k):
       to += 1
-  r.place[w, k] = to
+  part = int(0)  # noqa: RUF046, UP018
+  if r.type[w, k] >= _CONTACT:
+    part = k - r.contact_row[r.id[w, k], 0]
+  r.part[w, to] = part
   for f in range(r.moved.shape[0]):
-    r.kept[f, w, to] = r.moved[f].column[w, k]
-  for f in range(r.moved_float.shape[0]):
-    r.kept_float[f, w, to] = r.moved_float[f].column[w, k]
+    kept = r.kept[f].words
+    kept[w, to] = r.moved[f].words[w, k]
+
+
+@wp.func
+def _padded(n: int):
+  return (n + _TILE - 1) / _TILE * _TILE
+
+
+@wp.func
+def _put(r: Rows, w: int, k: int, lane: int):
+  for f in range(lane, r.moved.shape[0], _TILE):
+    column = r.moved[f].words
+    column[w, k] = r.kept[f].words[w, k]
+  if lane == 0:
+    kind, number = r.kept[_TYPE].words[w, k], r.kept[_ID].words[w, k]
+    if kind >= _CONTACT:
+      r.contact_row[number, r.part[w, k]] = k
+    elif kind == _FRICTION:
+      r.frictionadr[w, number] = k
+  start = r.kept[_ROWADR].words[w, k]
+  for q in range(start, start + r.kept[_ROWNNZ].words[w, k]):
+    i = r.colind[w, 0, q]
+    if i % _TILE == lane:
+      r.whole[w, k, i] = r.J[w, 0, q]
 
 
 @wp.kernel(enable_backward=False)
 def _move(r: Rows):
-  """Moves rows to their places, and finds those of blocks."""
-  w, k = wp.tid()
-  if k < _count(r, w):
-    for f in range(r.moved.shape[0]):
-      column = r.moved[f].column
-      column[w, k] = r.kept[f, w, k]
-    for f in range(r.moved_float.shape[0]):
-      numbers = r.moved_float[f].column
-      numbers[w, k] = r.kept_float[f, w, k]
-    if r.type[w, k] >= _CONTACT:
-      r.contact_row[r.id[w, k], r.part[w, k]] = k
-    elif r.type[w, k] == _FRICTION:
-      r.frictionadr[w, r.id[w, k]] = k
-  if k < r.nblock[w]:
-    adr = r.place[w, r.block_adr[w, k]]
-    to = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-    for q in range(r.nblock[w]):
-      to += wp.where(r.place[w, r.block_adr[w, q]] < adr, 1, 0)
-    r.kept_block[0, w, to] = adr
-    r.kept_block[1, w, to] = r.block_nrow[w, k]
+  """Moves rows to their places, and spreads them over all dofs, of which a thread has every 16th.
+
+  Beyond the last row the last tile is zero.
+  """
+  w, first, lane = wp.tid()
+  n = _count(r, w)
+  for k in range(first, _padded(n), _ROWS):
+    for i in range(lane, r.whole.shape[2], _TILE):
+      r.whole[w, k, i] = 0.0
+    if k < n:
+      _put(r, w, k, lane)
+
+
+@wp.func
+def _bend(r: Rows, Jaref: wp.array2d[float], w: int, n: int, k: int, lane: int):
+  """Weighs a row of a contact whose force is on its cone, by mujoco_warp's curvature of that."""
+  head = k - r.part[w, k]
+  friction = r.friction[r.id[w, k]]
+  mu = friction[0] * r.impratio_invsqrt[w % r.impratio_invsqrt.shape[0]]
+  dim = int(1)  # noqa: RUF046, UP018 - a variable to Warp
+  square = float(0.0)  # noqa: UP018
+  while head + dim < n and r.part[w, head + dim] == dim:
+    u = Jaref[w, head + dim] * friction[dim - 1]
+    square += u * u
+    dim += 1
+  t = wp.max(wp.sqrt(square), 1e-15)
+  ratio = mu * Jaref[w, head] * mu / t
+  curve = mu * mu - ratio
+  scale = r.D[w, head] / wp.max(mu * mu * (1.0 + mu * mu), 1e-15)
+  own = mu
+  if k > head:
+    own = friction[k - head - 1]
+  for i in range(lane, r.whole.shape[2], _TILE):
+    normal = mu * r.whole[w, head, i]
+    along = float(0.0)  # noqa: UP018
+    for d in range(1, dim):
+      u = Jaref[w, head + d] * friction[d - 1] / t
+      along += u * friction[d - 1] * r.whole[w, head + d, i]
+    value = normal - mu * along
+    if k > head:
+      u = Jaref[w, k] * own / t
+      value = u * (ratio * along - mu * normal) + curve * own * r.whole[w, k, i]
+    r.weighed[w, k, i] = scale * own * value
 
 
 @wp.kernel(enable_backward=False)
-def _move_blocks(r: Rows):
-  """Moves blocks to their places."""
-  w, k = wp.tid()
-  if k < r.nblock[w]:
-    r.block_adr[w, k] = r.kept_block[0, w, k]
-    r.block_nrow[w, k] = r.kept_block[1, w, k]
+def _weigh(r: Rows, Jaref: wp.array2d[float], done: wp.array[bool]):
+  """Finds the rows W of J^T W, the constraints' part of the Hessian.
+
+  It is D J where the cost is quadratic. On a contact's cone it is C J, with the curvature C of the
+  contact's rows; those of a dof's friction have been added to the Hessian's diagonal.
+  """
+  w, first, lane = wp.tid()
+  if done[w]:
+    return
+  n = _count(r, w)
+  for k in range(first, _padded(n), _ROWS):
+    weight = float(0.0)  # noqa: UP018 - a variable to Warp
+    bent = bool(False)  # noqa: UP018
+    if k < n:
+      bent = r.state[w, k - r.part[w, k]] == _CONE
+      if r.state[w, k] == _QUADRATIC and r.type[w, k] != _FRICTION:
+        weight = r.D[w, k]
+    if bent:
+      _bend(r, Jaref, w, n, k, lane)
+    else:
+      for i in range(lane, r.whole.shape[2], _TILE):
+        r.weighed[w, k, i] = weight * r.whole[w, k, i]
+
+
+@wp.kernel(module="unique", enable_backward=False, module_options={"enable_mathdx_gemm": False})
+def _add_hessian(r: Rows, done: wp.array[bool], h: wp.array3d[float]):
+  """Adds J^T W to the upper triangle of the Hessian, a block a tile."""
+  w, tile, _lane = wp.tid()
+  if done[w]:
+    return
+  j = int((wp.sqrt(float(8 * tile + 1)) - 1.0) * 0.5)
+  i = (tile - j * (j + 1) // 2) * _TILE
+  j = j * _TILE
+  total = wp.tile_load(h[w], shape=(_TILE, _TILE), offset=(i, j), storage="shared")
+  for k in range(0, _count(r, w), _TILE):
+    a = wp.tile_load(r.whole[w], shape=(_TILE, _TILE), offset=(k, i))
+    b = wp.tile_load(r.weighed[w], shape=(_TILE, _TILE), offset=(k, j))
+    wp.tile_matmul(wp.tile_transpose(a), b, total)
+  wp.tile_store(h[w], total, offset=(i, j))
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def _gradient(
+  r: Rows, smooth: wp.array2d[float], Ma: wp.array2d[float], done: wp.array[bool],
+  qfrc: wp.array2d[float], grad: wp.array2d[float], square: wp.array[float],
+  decrement: wp.array[float], scale: wp.array[float], unchanged: wp.array[bool],
+):  # fmt: skip
+  """Finds J^T f and the gradient, a block a world, and its square."""
+  w, lane = wp.tid()
+  unchanged[w] = False
+  if done[w]:
+    return
+  mine = float(0.0)  # noqa: UP018 - a variable to Warp
+  for i in range(lane, Ma.shape[1], wp.block_dim()):
+    total = float(0.0)  # noqa: UP018
+    for k in range(_count(r, w)):
+      total += r.whole[w, k, i] * r.force[w, k]
+    g = Ma[w, i] - smooth[w, i] - total
+    qfrc[w, i] = total
+    grad[w, i] = g
+    mine += g * g
+  whole = wp.tile_reduce(wp.add, wp.tile(mine, preserve_type=True))
+  if lane == 0:
+    square[w] = whole[0]
+    decrement[w] = 0.0
+    scale[w] = 1.0
 
 
 # In place of kernels of mujoco_warp's, with their arguments.
-
-
-@functools.cache
-def _gradient(stable_fast: bool, deterministic: bool) -> wp.Kernel:
-  """Returns the kernel of the gradient, one thread adding up its square."""
-
-  @wp.kernel(module="unique", enable_backward=False)
-  def gradient(
-    smooth: wp.array2d[float], constraint: wp.array2d[float], Ma: wp.array2d[float],
-    changed: wp.array[int], done: wp.array[bool],
-    out: wp.array2d[float], square: wp.array[float],
-  ):  # fmt: skip
-    w, i = wp.tid()
-    if done[w]:
-      return
-    out[w, i] = Ma[w, i] - smooth[w, i] - constraint[w, i]
-    if i == 0:
-      total = float(0.0)  # noqa: UP018 - a variable to Warp
-      for k in range(Ma.shape[1]):
-        g = Ma[w, k] - smooth[w, k] - constraint[w, k]
-        total += g * g
-      square[w] = total
-
-  return gradient
-
-
-@functools.cache
-def _constraint_force(compact: bool, nv: int, deterministic: bool) -> wp.Kernel:
-  """Returns the kernel of J^T f: a thread has every 16th dof, and goes over the rows in order."""
-
-  @wp.kernel(module="unique", enable_backward=False)
-  def constraint_force(
-    nefc: wp.array[int], rownnz: wp.array2d[int], rowadr: wp.array2d[int],
-    colind: wp.array3d[int], J: wp.array3d[float], force: wp.array2d[float],
-    cdof: wp.array2d[int], changed: wp.array[int], done: wp.array[bool], out: wp.array2d[float],
-  ):  # fmt: skip
-    w, lane = wp.tid()
-    lanes = wp.min(_LANES, force.shape[1])
-    if lane >= lanes or done[w] or changed[w] == 0:
-      return
-    for k in range(wp.min(nefc[w], force.shape[1])):
-      f = force[w, k]
-      if f != 0.0:
-        for q in range(rowadr[w, k], rowadr[w, k] + rownnz[w, k]):
-          i = colind[w, 0, q]
-          if i % lanes == lane:
-            out[w, i] = out[w, i] + J[w, 0, q] * f
-
-  return constraint_force
 
 
 @functools.cache
@@ -369,17 +415,16 @@ def is_enough(m: Any, model: mujoco.MjModel) -> bool:
 
 
 def _words(array: wp.array) -> wp.array:
-  """Returns an array of numbers of 32 bits in words, a row an element."""
-  count = wp.types.type_size_in_bytes(array.dtype) // 4
-  shape = array.shape[0], count
+  """Returns an array of numbers of 32 bits as words, in two dimensions."""
+  width = wp.types.type_size_in_bytes(array.dtype) // 4
+  shape = array.shape if array.ndim == 2 else (array.shape[0], width)
   return wp.array(ptr=array.ptr, dtype=int, shape=shape, device=array.device)
 
 
-def _columns(kind: Any, arrays: list[wp.array]) -> wp.array:
+def _columns(arrays: list[wp.array]) -> wp.array:
   """Returns an array of structs, each of which refers to one of the arrays."""
-  device = arrays[0].device
-  columns = [fill(kind, device, {"column": each}) for each in arrays]
-  return wp.array(columns, dtype=kind, device=device)
+  columns = [fill(Column, array.device, {"words": array}) for array in arrays]
+  return wp.array(columns, dtype=Column, device=arrays[0].device)
 
 
 class FixedOrder:
@@ -388,42 +433,52 @@ class FixedOrder:
   def __init__(self, m: Any, d: Any):
     """Makes room for contacts and rows on their way."""
     efc, contact, shape = d.efc, d.contact, (d.nworld, d.njmax)
+    self._kept: list[wp.array] = []
     device = efc.type.device
-    part = wp.zeros(shape, dtype=int, device=device)
-    moved = [*(getattr(efc, name) for name in _INTS), part]
-    numbers = [getattr(efc, name) for name in _FLOATS]
     values = dict(
       nefc=d.nefc,
-      nblock=efc.jtdaj_nblock,
-      block_adr=efc.jtdaj_adr,
-      block_nrow=efc.jtdaj_nrow,
       type=efc.type,
       id=efc.id,
       frictionadr=d.dof_frictionadr,
       contact_row=contact.efc_address,
-      moved=_columns(Ints, moved),
-      moved_float=_columns(Floats, numbers),
-      part=part,
+      part=np.zeros(shape),
+      friction=contact.friction,
+      impratio_invsqrt=m.opt.impratio_invsqrt,
+      D=efc.D,
+      state=efc.state,
+      force=efc.force,
+      colind=efc.J_colind,
+      J=efc.J,
     )
-    rooms = {"place": (), "kept": (len(moved),), "kept_float": (len(numbers),), "kept_block": (2,)}
-    values |= {name: np.zeros((*more, *shape)) for name, more in rooms.items()}
-    self._rows = fill(Rows, device, values | {"key": np.zeros(shape, np.int64)})
+    tiles = m.nv_pad // _TILE
+    self._tiles = tiles * (tiles + 1) // 2
+    padded = -(-d.njmax // _TILE) * _TILE
+    values |= {name: np.zeros((d.nworld, padded, m.nv_pad)) for name in ("whole", "weighed")}
+    self._spread = d.nworld, _ROWS, _TILE
+    values |= self._room_for([getattr(efc, name) for name in _COLUMNS])
+    self._rows = fill(Rows, device, values)
     self._shape = shape
     each = [getattr(contact, name.name) for name in dataclasses.fields(contact)]
-    words = [_words(array) for array in each if array.shape == contact.dist.shape]
+    columns = self._room_for([array for array in each if array.shape == contact.dist.shape])
     self._pairs = fill(Pairs, device, dict(
       ngeom=m.ngeom,
       nacon=d.nacon,
       geom=contact.geom,
       number=contact.geomcollisionid,
       worldid=contact.worldid,
-      moved=_columns(Ints, words),
+      **columns,
       count=np.zeros(d.nworld),
       before=np.zeros(d.nworld),
       listed=np.zeros((d.nworld, _ROOM)),
       place=np.zeros(d.naconmax),
-      kept=np.zeros((sum(array.shape[1] for array in words), d.naconmax)),
     ))  # fmt: skip
+
+  def _room_for(self, arrays: list[wp.array]) -> dict[str, wp.array]:
+    """Returns the columns of arrays that move, and of others that keep them meanwhile."""
+    words = [_words(array) for array in arrays]
+    kept = [wp.empty_like(array) for array in words]
+    self._kept += kept
+    return {"moved": _columns(words), "kept": _columns(kept)}
 
   def sort_contacts(self) -> None:
     """Launches what puts contacts in order, once those of geoms are found and before others are."""
@@ -432,24 +487,62 @@ class FixedOrder:
     wp.launch(_list_contacts, dim=p.place.shape, inputs=[p], device=device)
     wp.launch(_place_contacts, dim=p.listed.shape, inputs=[p], device=device)
     wp.utils.array_scan(p.count, p.before, inclusive=False)
-    wp.launch(_keep_contacts, dim=p.place.shape, inputs=[p], device=device)
-    wp.launch(_move_contacts, dim=p.place.shape, inputs=[p], device=device)
+    for kernel in (_keep_contacts, _move_contacts):
+      wp.launch(kernel, dim=(p.place.size, p.moved.size), inputs=[p], device=device)
 
   def sort(self) -> None:
     """Launches what puts the rows in order, once they are made and before they are used."""
-    for kernel in (_find_keys, _keep, _move, _move_blocks):
-      wp.launch(kernel, dim=self._shape, inputs=[self._rows], device=self._rows.nefc.device)
+    rows, device = [self._rows], self._rows.nefc.device
+    wp.launch(_keep, dim=self._shape, inputs=rows, device=device)
+    wp.launch(_move, dim=self._spread, inputs=rows, device=device)
 
-  @staticmethod
+  def _update_constraint(self, m, d, ctx, track_changes=False, stable_fast=False) -> None:
+    """Launches what finds forces of rows, in place of mujoco_warp's; J^T f is the gradient's."""
+    contact, efc = d.contact, d.efc
+    wp.launch(
+      private.solver._update_constraint_efc(False),
+      dim=(d.nworld, d.njmax),
+      inputs=[
+        m.opt.impratio_invsqrt, d.ne, d.nf, d.nefc, contact.friction, contact.dim,
+        contact.efc_address, efc.type, efc.id, efc.D, efc.frictionloss, d.nacon, ctx.Jaref,
+        ctx.ls_exhausted, ctx.done,
+      ],
+      outputs=[efc.force, efc.state, ctx.quad_changed_ids, ctx.quad_changed_count,
+               ctx.state_changed_count],
+    )  # fmt: skip
+
+  def _update_gradient(self, m, d, ctx, compact=False) -> None:
+    """Launches what finds the gradient, the Hessian and the search, in place of mujoco_warp's."""
+    wp.launch_tiled(
+      _gradient,
+      dim=d.nworld,
+      inputs=[self._rows, d.qfrc_smooth, d.efc.Ma, ctx.done],
+      outputs=[d.qfrc_constraint, ctx.grad, ctx.grad_dot, ctx.newton_decrement, ctx.grad_scale,
+               ctx.search_unchanged],
+      block_dim=128,
+    )  # fmt: skip
+    solver = private.solver
+    wp.launch(
+      solver._update_gradient_init_h_sparse(False),
+      dim=(d.nworld, m.nv_pad, solver._INIT_H_LANES),
+      inputs=[m.nv, m.M_elemid, d.nf, d.M, d.efc.D, d.efc.state, d.dof_frictionadr, d.cdof_dof,
+              ctx.done],
+      outputs=[ctx.h],
+    )  # fmt: skip
+    wp.launch(_weigh, dim=self._spread, inputs=[self._rows, ctx.Jaref, ctx.done])
+    wp.launch_tiled(
+      _add_hessian, dim=(d.nworld, self._tiles), inputs=[self._rows, ctx.done, ctx.h], block_dim=64
+    )
+    solver._cholesky_factorize_solve(m, d, ctx)
+
   @contextlib.contextmanager
-  def adding() -> Iterator[None]:
+  def adding(self) -> Iterator[None]:
     """Lets what mujoco_warp launches within add up in order."""
     solver, sensor = private.solver, private.sensor
     instead: dict[tuple[Any, str], Any] = {
-      (solver, "_jtdaj_groups_per_world"): lambda *sizes: 1,  # who adds blocks up
       (solver, "_use_incremental"): lambda m: False,
-      (solver, "_update_gradient_grad"): _gradient,
-      (solver, "_update_constraint_init_qfrc_constraint_sparse"): _constraint_force,
+      (solver, "_update_constraint"): self._update_constraint,
+      (solver, "_update_gradient"): self._update_gradient,
       (private.passive, "_gravity_force"): _compensation,
       (sensor, "_contact_sort"): sort_matches,
       (sensor, "_sensor_touch"): lambda deterministic: kept[sensor, "_sensor_touch"](True),
