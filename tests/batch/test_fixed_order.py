@@ -1,5 +1,7 @@
 """Batches that repeat to the bit: rows of constraints are in an order of their own."""
 
+import contextlib
+
 import mujoco
 import numpy as np
 import palpate.batch
@@ -7,6 +9,7 @@ import pytest
 import warp as wp
 from devices import needs_cuda
 from palpate.batch.contact.fixed_order import FixedOrder, is_enough, sort_matches
+from palpate.batch.private import ConstraintState, solver
 from scenes import probed
 
 ROWS = ("type", "id", "J_rownnz", "J_rowadr", "pos", "margin", "D", "vel", "aref", "frictionloss")
@@ -127,6 +130,29 @@ def test_runs_repeat_to_the_bit(device):
     assert np.array_equal(getattr(a, name).numpy(), getattr(b, name).numpy()), name
   found = [each.organ("organ").contact_force.numpy() for each in (a, b)]
   assert np.array_equal(found[0], found[1]) and np.abs(found[0]).max() > 0.01
+
+
+def test_gradient_and_hessian_are_those_of_mujoco_warp():
+  """Of contacts with all kinds of friction that slide, so that forces are on their cones."""
+  spec = mujoco.MjSpec.from_string(probed(condim=6, cone="elliptic"))
+  for each in (*spec.geoms, *spec.flexes):
+    each.friction[0] = 0.05
+  batch = palpate.batch.make(spec, 3, "warp-cpu", deterministic=True)
+  for k in range(25):
+    batch.ctrl = np.array([[-0.0002 * k, 0.0004 * k], [-0.0002 * k, -0.0004 * k], [0.0, 0.0]])
+    batch.step()
+  m, d, order, found = batch.m, batch.d, FixedOrder(batch.m, batch.d), []
+  order.sort()
+  for adding in (contextlib.nullcontext, order.adding):
+    context = solver._create_solver_context(m, d)
+    with adding():
+      solver.init_context(m, d, context)
+    sums = context.grad, context.grad_dot, d.qfrc_constraint
+    matrix = np.triu(context.h.numpy()[:, : m.nv, : m.nv])
+    found.append([matrix, *(values.numpy().copy() for values in sums)])
+  assert (d.efc.state.numpy()[:2] == ConstraintState.CONE).any(axis=1).all()
+  for values in zip(*found, strict=True):
+    np.testing.assert_allclose(*values, rtol=1e-5, atol=1e-8)  # digits of float32
 
 
 def test_what_is_not_known_is_left_to_warp():
