@@ -3,7 +3,9 @@
 import mujoco
 import numpy as np
 import palpate
+import palpate.batch
 import pytest
+from devices import needs_cuda
 from palpate.tasks.core import stage
 from palpate.tasks.core.scenes import Scene
 from palpate.tasks.domains import drain
@@ -32,3 +34,28 @@ def test_a_drain_with_a_slit_has_a_thread_through_its_marks():
   assert first.at[0] - second.at[0] == pytest.approx(drain.BITE, rel=0.05)  # of a polygon
   assert drain.gap(organ.xpos, NODES) == pytest.approx(drain.GAPE, rel=0.02)
   assert organ.bonds.share_freed == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("device", ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)])
+def test_many_worlds_have_the_scene_of_fls(device):
+  """The drain with its thread sewn through it, the needle and two instruments, as in one world."""
+  ports = {"port": (-0.06, 0.04, 0.13), "second_port": (0.06, 0.04, 0.13)}
+  scene = Scene(instrument="psm", second="psm", nodes=NODES, surroundings="none", **ports)
+  line = drain.MIDDLE + np.linspace(-0.03, 0.02, 80)[:, None] * (1, 0, 0)
+  batch = palpate.batch.make(drain.build(scene, line), 2, device)
+  model = batch.model
+  data = mujoco.MjData(model)
+  organ = palpate.Organ(model, data, "organ")
+  thread = drain.sew(organ, line)
+  batch.start(data)
+  batch.reset()
+  for _ in range(20):
+    batch.step()
+    mujoco.mj_step(model, data)
+  places = batch.thread(drain.THREAD).xpos.numpy()
+  np.testing.assert_allclose(places, np.stack([thread.positions] * 2), atol=2e-5)
+  assert np.abs(thread.positions - line).max() > 5e-4  # it has fallen
+  nodes = batch.organ("organ").xpos.numpy()
+  np.testing.assert_allclose(nodes, np.stack([organ.xpos] * 2), atol=2e-5)
+  assert batch.organ("organ").needles.count.numpy().tolist() == [[2], [2]]
