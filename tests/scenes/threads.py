@@ -3,6 +3,8 @@
 import mujoco
 import numpy as np
 import palpate
+from palpate.tasks.core.scenes import ORGAN, Scene
+from palpate.tasks.domains import drain
 from palpate.tasks.metrics import knots
 from palpate.tissue.sutures import DIAMETER, SUTURES
 
@@ -73,6 +75,14 @@ def load(points, hands=(), h=1e-3, damping=2.0, **config):
   spec = mujoco.MjSpec()
   spec.option.gravity, spec.option.timestep = (0, 0, 0), h
   palpate.add_thread(spec, points, "t", **config)
+  add_hands(spec, "t", points, hands, damping)
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  return model, data, palpate.Thread(model, data, "t")
+
+
+def add_hands(spec, thread, points, hands, damping):
+  """Adds what holds nodes of a thread, see `load`."""
   for k, (node, way) in enumerate(hands):
     name = f"hand_{k}"
     hand = spec.worldbody.add_body(name=name, pos=points[node])
@@ -84,12 +94,9 @@ def load(points, hands=(), h=1e-3, damping=2.0, **config):
       type=mujoco.mjtEq.mjEQ_CONNECT,
       objtype=mujoco.mjtObj.mjOBJ_BODY,
       name1=name,
-      name2=f"t_{node}",
+      name2=f"{thread}_{node}",
       solref=[0.002, 1],
     )
-  model = spec.compile()
-  data = mujoco.MjData(model)
-  return model, data, palpate.Thread(model, data, "t")
 
 
 def by_hands(points, force, steps, step=mujoco.mj_step, **config):
@@ -155,6 +162,32 @@ def throws(turns, radius, segment, ear=5e-3, arm=5e-3):
   joins = [left[:1] + share * (bow[:1] - left[:1]), bow[-1:] + share * (right[:1] - bow[-1:])]
   points = resampled(np.concatenate([left[::-1], joins[0], bow, joins[1], right]), segment)
   return points, *(int(np.linalg.norm(points - at, axis=1).argmin()) for at in bow[[0, -1]])
+
+
+def stitch(nodes, window=0, segment=4.5e-4):
+  """Returns a stitch through a slit drain with a square knot on top, its ends in hands.
+
+  Args:
+    nodes: of the drain, about
+    window: its nodes that instruments can touch at once, 0 for all
+    segment: length of the thread's edges [m]
+
+  Returns:
+    model, data and the thread, of some hundred nodes
+  """
+  knot, first, last = throws((1, -1), RADIUS, 0.5 * segment, ear=7e-3)
+  up = np.array([0, 0, drain.HIGH + 1e-3])
+  side = np.sign(knot[first, 0]) * np.array([0.5 * drain.BITE, 0, 0])
+  chord = np.linspace(drain.MIDDLE + side, drain.MIDDLE - side, 20)
+  points = resampled(np.concatenate([knot[:first] + up, chord, knot[last + 1 :] + up]), segment)
+  spec = drain.build(Scene(instrument="knot_pusher", nodes=nodes), points)
+  if window:
+    palpate.add_windows(spec, ORGAN, nodes=window)
+  ends = [(k, np.sign(points[k, 0]) * np.array([1, 0, 0])) for k in (0, len(points) - 1)]
+  add_hands(spec, drain.THREAD, points, ends, 20.0)
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  return model, data, drain.sew(palpate.Organ(model, data, ORGAN), points)
 
 
 def pull_test(
