@@ -37,6 +37,6 @@ def __getattr__(name: str) -> Any:
   return getattr(suite, name)
 
 
-for _module in pkgutil.iter_modules(domains.__path__):
-  importlib.import_module(f"{domains.__name__}.{_module.name}")
+for _module in pkgutil.walk_packages(domains.__path__, f"{domains.__name__}."):
+  importlib.import_module(_module.name)
 registry.find()

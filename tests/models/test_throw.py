@@ -5,7 +5,7 @@ import numpy as np
 import palpate
 import pytest
 from palpate.models import trocar, wrist
-from palpate.tasks.domains.needles import between
+from palpate.tasks.domains.suturing.needles import between
 from palpate.tasks.metrics import knots
 from scenes.threads import RADIUS
 

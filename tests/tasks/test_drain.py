@@ -8,7 +8,7 @@ import pytest
 from devices import needs_cuda
 from palpate.tasks.core import stage
 from palpate.tasks.core.scenes import Scene
-from palpate.tasks.domains import drain
+from palpate.tasks.domains.suturing import drain
 
 NODES = 150
 

@@ -6,7 +6,7 @@ import pytest
 from palpate.tasks import suite
 from palpate.tasks.batch.vector import Exercises, NotVectorisedError
 from palpate.tasks.core import episode, performer
-from palpate.tasks.domains import extracorporeal
+from palpate.tasks.domains.suturing import extracorporeal
 from palpate.tasks.metrics import knots
 from palpate.tasks.recording import Recording
 

@@ -7,7 +7,7 @@ import pytest
 from palpate.models import wrist
 from palpate.tasks import suite
 from palpate.tasks.core import episode, performer, stage
-from palpate.tasks.domains import running
+from palpate.tasks.domains.suturing import running
 from palpate.tasks.recording import Recording
 
 

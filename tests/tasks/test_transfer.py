@@ -5,7 +5,7 @@ import pytest
 from palpate.models import trocar
 from palpate.tasks import suite
 from palpate.tasks.core import performer
-from palpate.tasks.domains import transfer
+from palpate.tasks.domains.suturing import transfer
 from palpate.tasks.learn import lessons
 
 

@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 from palpate import tasks
-from palpate.tasks.domains import feeling
+from palpate.tasks.domains.probing import feeling
 from palpate.tasks.learn import lessons
 
 GRID = np.array([(0.008 * x, 0.008 * y, 0.0) for x in range(-3, 4) for y in range(-3, 4)])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from palpate import tasks
 from palpate.tasks.core import performer
-from palpate.tasks.domains import probe
+from palpate.tasks.domains.probing import probe
 from palpate.tasks.learn import lessons, policy
 
 

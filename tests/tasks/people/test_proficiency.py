@@ -7,7 +7,7 @@ import pytest
 from palpate import tasks
 from palpate.tasks import suite
 from palpate.tasks.core import episode, performer
-from palpate.tasks.domains import tease
+from palpate.tasks.domains.dissection import tease
 from palpate.tasks.people import score
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]

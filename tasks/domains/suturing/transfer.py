@@ -31,9 +31,9 @@ import warp as wp
 from palpate.models import trocar, wrist
 from palpate.tissue.types import Array
 
-from ..core.base import Physics
-from ..core.performer import Performer, Script
-from ..core.rules import (
+from ...core.base import Physics
+from ...core.performer import Performer, Script
+from ...core.rules import (
   HIDDEN,
   LATER,
   MISSED,
@@ -51,8 +51,8 @@ from ..core.rules import (
   tip,
   vector,
 )
-from ..core.scenes import Scene
-from ..registry import exercise
+from ...core.scenes import Scene
+from ...registry import exercise
 from .needles import (
   LOST,
   MEETS,

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array, floats, ints
 
-from ..core.rules import FAR, Vector, dot, length, many, root
+from ...core.rules import FAR, Vector, dot, length, many, root
 
 LEFT = 0.02  # force below which a press has ended [N]
 DEEP = 0.0028  # what tells enough [m]

@@ -13,9 +13,9 @@ import numpy as np
 from palpate.engine.model.flexes import matrix
 from palpate.models import trocar, wrist
 
-from ..core.base import Physics, Task
-from ..core.performer import Performer, Script
-from ..core.rules import (
+from ...core.base import Physics, Task
+from ...core.performer import Performer, Script
+from ...core.rules import (
   FAR,
   drop,
   length,

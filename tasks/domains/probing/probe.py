@@ -30,9 +30,9 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array, ints
 
-from ..core.base import Physics, Task
-from ..core.performer import Performer, Script
-from ..core.rules import (
+from ...core.base import Physics, Task
+from ...core.performer import Performer, Script
+from ...core.rules import (
   HIDDEN,
   LATER,
   NOW,
@@ -51,10 +51,10 @@ from ..core.rules import (
   root,
   tip,
 )
-from ..core.scenes import Scene
-from ..registry import exercise
+from ...core.scenes import Scene
+from ...registry import exercise
+from ..touch import SLACK, draw_apart
 from .palpation import Palpate
-from .touch import SLACK, draw_apart
 
 KIDNEY = Scene(
   organ="kidney", center="anterior", port=(0.03, 0.045, 0.12), camera=(-0.05, 0.12, 0.1)

@@ -25,9 +25,9 @@ import mujoco
 import numpy as np
 from palpate.engine.cutting.trails import SPARK
 
-from ..core.base import Physics
-from ..core.performer import Performer, Script
-from ..core.rules import (
+from ...core.base import Physics
+from ...core.performer import Performer, Script
+from ...core.rules import (
   DAMAGED,
   FAR,
   RUNNING,
@@ -47,12 +47,12 @@ from ..core.rules import (
   strand_distance,
   weaken,
 )
-from ..registry import exercise
+from ...registry import exercise
+from ..grasp import FUNDUS
 from . import dissect
 from .dissect import Dissect, hold, middle
 from .dissect import observe as look
 from .freeing import METRICS, count, earned, ruined
-from .grasp import FUNDUS
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed; ours, we know of no measurement. A
 # pull within the limits does not free it.

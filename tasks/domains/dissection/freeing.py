@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from ..core.base import Physics, Task
-from ..core.rules import (
+from ...core.base import Physics, Task
+from ...core.rules import (
   DAMAGED,
   RUNNING,
   SUCCESS,
@@ -16,7 +16,7 @@ from ..core.rules import (
   tear,
   traction,
 )
-from ..core.scenes import FILM, RAW, Scene, films
+from ...core.scenes import FILM, RAW, Scene, films
 
 SEEN = 1e-5  # what rounding may take from a share, in float32 too
 

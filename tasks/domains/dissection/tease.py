@@ -16,9 +16,9 @@ import itertools
 import mujoco
 import numpy as np
 
-from ..core.base import Physics
-from ..core.performer import Performer, Script
-from ..core.rules import (
+from ...core.base import Physics
+from ...core.performer import Performer, Script
+from ...core.rules import (
   FAR,
   NOW,
   Rules,
@@ -32,8 +32,8 @@ from ..core.rules import (
   tip,
   vector,
 )
-from ..core.scenes import Scene
-from ..registry import exercise
+from ...core.scenes import Scene
+from ...registry import exercise
 from . import adhesion
 from .freeing import METRICS, Freed, Freeing, count, earned, held, holding
 

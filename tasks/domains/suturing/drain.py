@@ -11,9 +11,9 @@ import numpy as np
 import palpate
 from palpate.models import mjcf
 
-from ..core import scenes
-from ..core.scenes import BED, ORGAN, Scene
-from . import sheet
+from ...core import scenes
+from ...core.scenes import BED, ORGAN, Scene
+from .. import sheet
 from .needles import RADIUS as CIRCLE
 
 THREAD = "thread"

@@ -37,9 +37,9 @@ import warp as wp
 from palpate.models import trocar, wrist
 from palpate.tissue.types import Array, floats, ints
 
-from ..core.base import Physics
-from ..core.performer import Performer, Script
-from ..core.rules import (
+from ...core.base import Physics
+from ...core.performer import Performer, Script
+from ...core.rules import (
   DAMAGED,
   FAR,
   HIDDEN,
@@ -61,10 +61,10 @@ from ..core.rules import (
   torn_at,
   vector,
 )
-from ..core.scenes import Scene
-from ..core.stage import STATE, Stage
-from ..registry import exercise
-from . import sheet
+from ...core.scenes import Scene
+from ...core.stage import STATE, Stage
+from ...registry import exercise
+from .. import sheet
 from .needles import (
   FRICTION,
   LOST,

@@ -12,10 +12,10 @@ from palpate.models import shapes
 from palpate.tissue.types import ints
 from scipy.spatial import cKDTree
 
-from ..core import scenes
-from ..core.base import Physics, Task
-from ..core.performer import Performer, Script
-from ..core.rules import (
+from ...core import scenes
+from ...core.base import Physics, Task
+from ...core.performer import Performer, Script
+from ...core.rules import (
   HIDDEN,
   LATER,
   MISSED,
@@ -32,7 +32,7 @@ from ..core.rules import (
   reach,
   tip,
 )
-from ..core.scenes import Scene
+from ...core.scenes import Scene
 from . import feeling
 from .feeling import APART, SHARED, SOFT, Notes, chance, nearest, press, sure
 

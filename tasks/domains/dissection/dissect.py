@@ -20,9 +20,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..core.base import Physics
-from ..core.performer import Performer, Script
-from ..core.rules import (
+from ...core.base import Physics
+from ...core.performer import Performer, Script
+from ...core.rules import (
   NOW,
   Rules,
   Vector,
@@ -37,10 +37,10 @@ from ..core.rules import (
   tip,
   vector,
 )
-from ..core.scenes import Scene
-from ..registry import exercise
+from ...core.scenes import Scene
+from ...registry import exercise
+from ..grasp import FUNDUS, Held, Hold, distance, follow
 from .freeing import METRICS, Freed, Freeing, count, earned, held, holding
-from .grasp import FUNDUS, Held, Hold, distance, follow
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed, and of a tough one. Ours: we know
 # of no measurement; the bed bears the organ, and comes away under half a newton or one.

@@ -27,9 +27,9 @@ import palpate
 import warp as wp
 from palpate.tissue.types import Array, floats
 
-from ..core.base import Physics
-from ..core.performer import Performer, Script
-from ..core.rules import (
+from ...core.base import Physics
+from ...core.performer import Performer, Script
+from ...core.rules import (
   DAMAGED,
   HIDDEN,
   LATER,
@@ -47,9 +47,9 @@ from ..core.rules import (
   pinhole,
   vector,
 )
-from ..core.scenes import Scene
-from ..registry import exercise
-from . import sheet
+from ...core.scenes import Scene
+from ...registry import exercise
+from .. import sheet
 from .needles import (
   FRICTION,
   LOST,

@@ -26,12 +26,12 @@ import mujoco
 import numpy as np
 from palpate.models import trocar
 
-from ..core.base import Physics, Task
-from ..core.performer import Performer, Script
-from ..core.rules import closeness
-from ..core.scenes import CONTACT, Scene
-from ..metrics import knots
-from ..registry import exercise
+from ...core.base import Physics, Task
+from ...core.performer import Performer, Script
+from ...core.rules import closeness
+from ...core.scenes import CONTACT, Scene
+from ...metrics import knots
+from ...registry import exercise
 from . import drain
 from .drain import MIDDLE
 

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from palpate.models import catalog, mjcf, situs
 
-from ..core import scenes
-from ..core.scenes import BED, Scene
+from ...core import scenes
+from ...core.scenes import BED, Scene
 
 LENGTH, WIDTH, FLAP = 0.05, 0.024, 0.018  # of what lies, across, and of what stands [m]
 # Radius of the bend [m], and how steep the flap then goes on [rad].

@@ -1,0 +1,1 @@
+"""Exercises with needles and threads, and the scenes they play in."""
