@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import palpate
 from palpate.tasks.core.scenes import ORGAN, Scene
-from palpate.tasks.domains import drain
+from palpate.tasks.domains.suturing import drain
 from palpate.tasks.metrics import knots
 from palpate.tissue.sutures import DIAMETER, SUTURES
 
