@@ -194,15 +194,21 @@ class Networks:
 
   # Lessons.
 
-  def learn(self, lessons: Sequence[Lesson], stop: Callable[[], bool] = lambda: False) -> float:
-    """Learns to do what was done in lessons, and what comes of it; returns the error."""
+  def learn(self, lessons: Sequence[Lesson], spent: Callable[[], float] = lambda: 0.0) -> float:
+    """Learns to do what was done in lessons, and what comes of it; returns the error.
+
+    Args:
+      lessons: of all rounds
+      spent: share of the time for it that is over: the learning rate falls in that time, and at 1
+        it stops
+    """
     self.remember(lessons)
     parameters = [*self._parts(), *self.critic.mlp.parameters()]
     optimiser = torch.optim.Adam(parameters, lr=_RATE)
     falling = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=CLONING)
     losses = []
     for _ in range(CLONING):
-      if stop():
+      if (share := spent()) >= 1.0:
         break
       some = self._some()
       loss = self._error(some)
@@ -212,6 +218,7 @@ class Networks:
       both.backward()
       torch.nn.utils.clip_grad_norm_(parameters, 1.0)
       optimiser.step()
+      falling.last_epoch = min(max(falling.last_epoch, int(share * CLONING)), CLONING - 1)
       falling.step()
       losses.append(loss.detach())
     return float(torch.stack(losses[-_LAST:]).mean()) if losses else math.nan

@@ -19,9 +19,9 @@ def give(job):
   return Lesson(ROWS, ROWS, ROWS, taught, ROWS[:, 0], "success", alone=False)
 
 
-def learn(lessons, stop):
+def learn(lessons, spent):
   for _ in range(40):
-    if stop():
+    if spent() >= 1.0:
       return 0.5
     time.sleep(0.05)
   return 0.1

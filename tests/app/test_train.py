@@ -1,6 +1,7 @@
 """`palpate train`, from an empty folder to a policy that `palpate evaluate` runs."""
 
 import csv
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -182,6 +183,20 @@ def test_what_is_held_from_the_start_is_no_change_to_learn(monkeypatch):
   learned = made.policy(task, {}, {})
   assert learned.about.initial_action == list(first)
   assert learned.begin()({"target": seen[0]})[1] == pytest.approx(0.5, abs=0.05)
+
+
+def test_the_learning_rate_falls_in_the_time_there_is(monkeypatch):
+  monkeypatch.setattr(networks, "CLONING", 700)
+  random = np.random.RandomState(0)
+  seen = random.randn(12, 3).astype(np.float32)
+  meant = np.tanh(seen[:, :2] * seen[:, 1:])
+  lesson = Lesson(seen, meant, meant, np.ones(12, bool), seen[:, 0], "success", False)
+  errors = []
+  for end in (lambda k: float(k >= 60), lambda k: k / 60):
+    made = networks.Networks({"target": (3,)}, ("pitch", "yaw"), 16, (16,), 0.1, 0, "cpu")
+    steps = itertools.count()
+    errors.append(made.learn(2 * [lesson], lambda end=end, steps=steps: end(next(steps))))
+  assert errors[1] < 0.9 * errors[0]
 
 
 def test_a_policy_is_judged_by_an_episode_in_each_world():

@@ -128,13 +128,13 @@ class School:
       raise CommandError(f"{self.task}: no lesson was given: {why}", code=1)
     error = math.nan  # where it needed no help, or not yet
     if any(lesson.taught.any() for lesson in self.lessons):
-      turns = itertools.count(1)
+      turns, before = itertools.count(1), time.perf_counter() - start
 
-      def learning() -> bool:
+      def spent() -> float:
         progress.show(f"round {self.rounds + 1}: learning, step {next(turns)}")
-        return over()
+        return 1.0 if over() else (time.perf_counter() - start - before) / (left - before)
 
-      error = networks.learn(self.lessons, learning)
+      error = networks.learn(self.lessons, spent)
     progress.clear()
     self.rounds += 1
     self.seconds += time.perf_counter() - start
