@@ -39,6 +39,7 @@ constexpr double BELOW = 0.02;  // edges under the surface where a tip is in a s
 constexpr int BESIDE = 2;  // edges from the one that is in a hole to those that tell how a thread turns there
 constexpr double HAIRPIN = 0.2;  // least share of a thread's friction along the mean of its directions, where it turns back
 constexpr double ENDS = 1e-9;   // share of a thread, or of its last edge, that is its end
+constexpr double BACK = 2e-3;   // of a needle's length that a hole goes back onto it, lest it goes to and fro
 constexpr double STOPS = 1e6;   // what a bead there bears at a hole [N]
 constexpr double MISSES = 0.7;  // of its way, that a hole does not follow where it is torn out
 constexpr double TIGHT = 1e-9;  // of what tissue bears, to which a return mapping brings it
@@ -445,9 +446,11 @@ PALPATE void follow_thread(const Fields& f, int i, const Arc& arc, double* s, in
   place -= off > 0.0 ? off - slack : off + slack;
   const double whole = thread.length();
   place = place < whole ? place : whole;
-  if (place > 0.0) return;  // else on the needle again, where that is still at its end
-  if (norm(arc.place(0.0) - thread.at(0)) < thread.edge(0)) place = hole(s, n)[HOLE_SLIP] = 0.0;
-  else place = 2.0 * thread.length();
+  if (place > 0.0) return;
+  // It is at the swage, or on the needle again; or out, where the needle is no longer at the thread's end.
+  if (norm(arc.place(0.0) - thread.at(0)) > thread.edge(0)) place = 2.0 * whole;
+  else if (arc.nearest(p) > BACK * arc.length) place = hole(s, n)[HOLE_SLIP] = 0.0;
+  else place = ENDS * thread.edge(0);
 }
 
 // Holds a thread in a hole: by the force that its step has found, and less as the tissue then follows it.
