@@ -6,10 +6,12 @@
 No expert and no demonstration takes part. The environment pays the change of a potential, which
 tells the way from anywhere in the scene (tasks/core/base.py, "Reward"). The algorithm is that of
 Schulman et al. 2017 (10.48550/arXiv.1707.06347) with generalised advantages; the learning rate
-follows the change of the policy. Three things matter beside it:
+follows the change of the policy. What matters beside it:
 
 - Jaws are told to go a small step from where they are. On tissue that is a gentle force in
   proportion to the action; at full force a fold is over the limit at once, and grasping does harm.
+- Who grasps moves slowly, so that noise does not shake what is held, and is shown the last
+  millimetres to the site on a scale of their own: they decide whether a fold is between the jaws.
 - Rewards of a size that a network tells from its own noise: those of an episode add up to 10.
 - Episodes in which nothing was gained for a second or three begin anew.
 """
@@ -28,6 +30,7 @@ GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.99, 0.95, 0.2, 5, 8
 KL, ENTROPY, NOISE = 0.015, 0.001, 0.4  # change of the policy aimed at, in a minibatch
 STEPS, SCALE = 16, 10.0  # control steps of an iteration, and how much larger rewards are
 JAW, CLOSED, WIDE = 0.03, -0.2, 1.0472  # a step of the jaws, and where they may be told to go [rad]
+PACE, FINE = 0.4, 0.005  # with jaws: share of the rates, and of what size offsets are seen too [m]
 PATIENCE, GAIN = (50, 150), 0.05  # control steps without so much more paid that end an episode
 UNSEEN = ("surface",)  # 96 numbers on the whole organ, which these exercises do not need
 
@@ -76,15 +79,18 @@ class Worlds:
   def rows(self, seen: dict[str, torch.Tensor]) -> torch.Tensor:
     """Returns observations as rows  (nworld, nseen)."""
     self.progress = seen["progress"].float()
+    rows = [v.flatten(1).float() for k, v in seen.items() if k not in UNSEEN]
     self.opening = seen["gripper"][:, :1] if "gripper" in seen else None
-    return torch.cat([v.flatten(1).float() for k, v in seen.items() if k not in UNSEEN], 1)
+    if self.opening is not None:
+      rows.append((seen["target"].float() / FINE).clamp(-1, 1))
+    return torch.cat(rows, 1)
 
   def step(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Takes a control step; returns what is seen, paid, and whether it is won: 1, 0, NaN as yet."""
     told = action.clamp(-1, 1)
     if self.opening is not None:
       share = 2 * (self.opening + JAW * told[:, 4:] - CLOSED) / (WIDE - CLOSED) - 1
-      told = torch.cat([told[:, :4], share.clamp(-1, 1)], 1)
+      told = torch.cat([PACE * told[:, :4], share.clamp(-1, 1)], 1)
     seen, paid, _, _, info = self.env.step(told.float())
     won = torch.full((len(told),), math.nan, device=told.device)
     if "final_info" in info:

@@ -21,7 +21,8 @@ included, or the time limit.
 
 Shaping: until it is grasped 0.36 * `ready`, for jaws that are open near the site, are over the fold
 and close on it; then 0.3 * (1 - min(height / lift, 1)), less 0.15 * d / (1 + d) where the fold is
-pushed down by d lifts; 0 once held long enough.
+pushed down by d lifts. Once held long enough it is 0, and 0.015 * (1 - 2 * pinch / force limit),
+not below 0, while the fold rests low: jaws that loosen are about to let go.
 """
 
 import dataclasses
@@ -49,6 +50,7 @@ from ..core.rules import (
   miss,
   opening,
   peak,
+  pinch,
   point,
   root,
   slipped,
@@ -70,6 +72,7 @@ OVER = 0.005  # how far the tip may go past a site before it is paid less: jaws 
 REST = 0.2  # at a low height before release [s]
 # Heights that it rests between, and is let go below, as shares of the lift.
 LOW, RESTING, LETTING = -0.25, 0.4, 0.5
+LOOSE = 0.015  # shaping of jaws that hold a fold at rest without force [-]
 
 
 @exercise("grasp/easy", 20, "easy")
@@ -114,11 +117,13 @@ class Held:
 def ready(s, o):
   """Returns how far the jaws are from the way there to closed on the site, 0 to 1 [-].
 
-  They are to be open as they come near, to go over the fold, and to close on it. Closed jaws push
-  the fold ahead of them: no site gets behind their tips, so only open ones have it within.
+  They are to be open as they come near, to go over the fold, and to close on it. Closed jaws that
+  press on a site push it ahead of them. Beside it they sink in and leave it behind their tips, so
+  a site that closed jaws have within is nearer to their axis.
   """
   off, wide = from_tip(s, point(s, o.site)), clamp(opening(s), 0.0, 1.0)
-  within = clamp(off[2] / OVER, 0.0, 1.0) * clamp(2.0 - aside(s, o) / ASIDE, 0.0, 1.0)
+  side = ASIDE * (0.6 + 0.4 * wide)
+  within = clamp(off[2] / OVER, 0.0, 1.0) * clamp(2.0 - aside(s, o) / side, 0.0, 1.0)
   return 0.4 * max(near(s, o), 0.0) * max(wide, within) + 0.6 * within * (1.0 - 0.6 * wide)
 
 
@@ -273,9 +278,10 @@ def advance(s, o):
 
 
 def shaping(s, o):
-  """Returns what tells the way to a grasp, and up from any depth that the fold was pushed to."""
+  """Returns what tells the way to a grasp, up from any depth of the fold, and to let go of it."""
   if o.done:
-    return 0.0
+    loose = clamp(1.0 - 2.0 * pinch(s) / o.force_limit, 0.0, 1.0)
+    return LOOSE * loose if o.lowered >= REST - SLACK else 0.0
   if o.grasped == 0.0:
     return 0.36 * ready(s, o)
   share = raised(s, o) / o.lift

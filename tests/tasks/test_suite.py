@@ -8,6 +8,7 @@ import pytest
 from palpate import models, tasks
 from palpate.tasks import metrics, registry, suite
 from palpate.tasks.core import engine, performer, scenes
+from palpate.tasks.domains import grasp
 
 IDS = ["/".join(pair) for pair in tasks.ALL_TASKS]
 _cache = {}
@@ -144,32 +145,37 @@ def test_dense_reward_is_the_change_of_progress_and_takes_back_what_is_lost():
 
 def test_a_potential_shows_the_way_to_a_grasp():
   env = load("grasp/easy")
-  potential = {}
+  potential, loose = {}, []
 
   def go(opening, *steps):
-    """Notes the potential after moves to heights over the site [m], and openings of the jaws."""
+    """Notes the potential after moves to heights over the site and beside it [m], and openings."""
     act = performer.make(env)
     timestep = env.reset()
     act.begin()
     act.extra[:] = opening
-    up = act.trocar.mat[:, 2]
+    across, _, up = act.trocar.mat.T
     site = env.physics.point(env.task.site)
-    for name, height, opening in steps:
-      for action in act.move(site + height * up, speed=0.03):
+    for name, height, opening, *aside in steps:
+      for action in act.move(site + height * up + sum(aside) * across, speed=0.03):
         env.step(action)
       while act.extra[0] > opening:
         act.extra -= 0.03
         timestep = env.step(act.step())
       potential[name] = env.task.progress + env.task.shaping
       assert not timestep.last() and potential[name] < 1
+    env.task.done, env.task.lowered = True, grasp.REST
+    loose.append(grasp.shaping(env.physics, env.task))
 
   go(-0.68, ("beside, closed", 0.01, -0.68), ("pressed, closed", -0.006, -0.68))
   go(1.0, ("beside", 0.01, 1.0), ("over it", -0.006, 1.0), ("closing", -0.006, -0.2),
      ("grasped", -0.006, -0.55), ("lifted", 0.001, -0.55), ("pushed", -0.012, -0.55),
      ("deep", -0.018, -0.55))  # fmt: skip
+  go(-0.68, ("sunk in aside, closed", -0.009, -0.68, 0.006))
   order = ["beside, closed", "beside", "over it", "closing", "grasped", "lifted"]
   assert sorted(order, key=potential.__getitem__) == order
+  assert loose[1] < 0.5 * grasp.LOOSE < 0.9 * grasp.LOOSE < loose[2] <= grasp.LOOSE
   assert potential["pressed, closed"] < potential["over it"] - 0.1
+  assert potential["sunk in aside, closed"] < potential["beside"]
   assert potential["deep"] < potential["pushed"] - 0.02 < potential["grasped"] - 0.04
 
 
