@@ -275,7 +275,8 @@ def draw(rows: list[Row], out: pathlib.Path) -> list[pathlib.Path]:
     for i, row in enumerate(mine):
       low, count = _counts(row[key])
       share = np.maximum(np.array(count) / max(sum(count), 1), 1e-6)
-      ax.bar(np.arange(len(low)) + 0.27 * i, share, 0.25, label=row["kind"])
+      width = 0.8 / len(mine)
+      ax.bar(np.arange(len(low)) + width * i, share, 0.9 * width, label=row["kind"])
       ax.set_xticks(np.arange(len(low)), [f"{x:g}" for x in low], rotation=60)
     ax.set(yscale="log", ylim=(1e-6, 1), xlabel=f"at least [{unit}]", ylabel="share")
   axes[0].set_title("how late a step began", loc="left", fontsize=9)
