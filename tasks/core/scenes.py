@@ -47,6 +47,7 @@ _IMPRATIO |= {"knot_pusher": 10}
 # Foundation of an organ that comes away from its bed [Pa/m]; ours: what lies around it lets go too.
 _LOOSE = 3e3
 _FILM = (0.0045, 0.0045, 0.0012)  # of the film where a bond is, and of the raw bed [m]
+_UNSEEN = 3  # group that no picture shows
 _TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # organ's frame to world
 
 
@@ -270,6 +271,9 @@ def furnish(
       _look(spec, scene, center)
     elif name:
       trocar.attach(spec, name, prefix, port, trocar.aim(port, center), scene.handle)
+  for geom in spec.geoms:
+    if geom.parent.name.endswith("handle"):
+      geom.group = _UNSEEN  # it would hide the tip
   if slots is None:
     touched = sum(_SLOTS[name] for name in (scene.instrument, scene.second) if name)
     slots = touched * max(1, -(-scene.nodes // 1000))

@@ -92,7 +92,7 @@ def _frame(ax: Any, points: np.ndarray) -> None:
     getattr(ax, f"set_{axis}lim")(c - h, c + h)
     getattr(ax, f"set_{axis}label")(f"{axis} [mm]", labelpad=6)
     getattr(ax, f"{axis}axis").set_pane_color((0.97, 0.97, 0.98, 1.0))
-  ax.locator_params(nbins=5)
+    ax.locator_params(axis=axis, nbins=5 if h > 0.5 * half.max() else 2)
   # A tall box would leave the figure.
   ax.set_box_aspect(half, zoom=min(1.0, 0.66 * float(np.linalg.norm(half) / half[2])))
   ax.view_init(elev=28, azim=-55)

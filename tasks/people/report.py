@@ -278,7 +278,14 @@ def _event_table(recording: Recording) -> str:
 
 def _about(recording: Recording, reference: Mapping[str, Any] | None) -> str:
   set_ = recording.settings
-  lines: dict[str, Any] = dict(recording.info)
+  lines: dict[str, Any] = {key: value for key, value in recording.info.items() if value != ""}
+  if "coach" in lines:
+    said = [f"{hint['time']:.1f} s: {hint['text']}" for hint in lines["coach"].get("hints", ())]
+    lines["coach"] = "; ".join(said) or "silent"
+  if "live" in lines:
+    live = lines["live"]
+    on_time = f"{100 * live['on_time']:.1f} % of {live['steps']} steps on time"
+    lines["live"] = "; ".join([on_time, *live.get("faults", ())])
   lines |= {
     "force limit": "none" if set_.force_limit is None else f"{set_.force_limit:g} N",
     "reference path": "none"

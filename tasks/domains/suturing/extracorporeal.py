@@ -248,7 +248,7 @@ class Extracorporeal(Task):
 
   def instruct(self, physics: Physics) -> str:
     """Says what is next."""
-    if self.laid == self.seated:
+    if self.laid == self.seated < self.throws:
       return "Take the pusher back up to the yellow mark"
     return f"Push throw {self.laid} of {self.throws} down until the slit is closed"
 

@@ -113,3 +113,13 @@ def test_gymnasium_takes_it():
   _, _, terminated, _, info = env.step(hold(env.unwrapped.environment).astype(np.float64))
   assert not terminated and info["outcome"] is None
   env.close()
+
+
+def test_pictures_do_not_show_the_handle():
+  seen = []
+  for how in ("drives", "handle"):
+    env = suite.load("touch", "easy", task_kwargs={"random": 0, "input": how})
+    env.reset()
+    camera = env.physics.model.ptr.camera("laparoscope").id
+    seen.append(env.physics.render(60, 80, camera_id=camera))
+  np.testing.assert_array_equal(*seen)

@@ -212,6 +212,14 @@ def test_the_head_says_what_happened_and_a_failure_is_at_the_floor(outcome, said
   assert "No composite score : the recording does not say how it ended" in text
 
 
+def test_what_a_live_exercise_has_noted_is_told_in_words():
+  recorder = _recorder()
+  recorder.info["coach"] = {"assessment": False, "hints": [{"time": 1.5, "text": "Press less"}]}
+  recorder.info["live"] = {"on_time": 0.998, "steps": 2000, "faults": ["udp: it is gone"]}
+  text = _Page(report.render(recorder.recording())).text()
+  assert "coach 1.5 s: Press less live 99.8 % of 2000 steps on time; udp: it is gone" in text
+
+
 def test_the_head_says_what_harmed_tissue():
   recorder = _recorder()
   recorder.event("note", 2.0, label="torn by a pull of 1.20 N")

@@ -23,7 +23,7 @@ function orders({done, proficient, moved, better, helps}) {
   const metric = ({label, value, limit, least}) => t(`{0}: {1}, skilled people have at ${least ? "least" : "most"} {2}`, t(label), shown(value), shown(limit));
   const found = moved ? [...helps.map(help => t(help)), ...done ? better.map(metric) : []].slice(0, 3) : [];
   if (!done) found.unshift(t("Try it again, slowly; Show me shows how"));
-  else if (!found.length) found.push(t(proficient ? "Everything is within its limits: do it again to be proficient" : "Try it again, slowly; Show me shows how"));
+  else if (!found.length) found.push(t(proficient ? "Everything is within its limits: do it again until it is a habit" : "Try it again, slowly; Show me shows how"));
   return found;
 }
 

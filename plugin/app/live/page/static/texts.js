@@ -105,7 +105,7 @@ const GERMAN = {
   "unit": "Einheit", "count": "Anzahl", "Score {0}": "Wertung {0}", "Better than most skilled people: {0}": "Besser als die meisten Könner: {0}", "You reached the end": "Du hast das Ende erreicht",
   "You kept within {0} of {1} limits": "Du hast {0} von {1} Grenzen eingehalten", "Nothing was measured: there was no movement": "Nichts wurde gemessen: es gab keine Bewegung",
   "{0}: {1}, skilled people have at most {2}": "{0}: {1}, Könner haben höchstens {2}", "{0}: {1}, skilled people have at least {2}": "{0}: {1}, Könner haben mindestens {2}",
-  "Everything is within its limits: do it again to be proficient": "Alles ist in seinen Grenzen: mach es noch einmal, um sicher zu werden", "Try it again, slowly; Show me shows how": "Versuche es noch einmal, langsam; Zeig es mir zeigt, wie",
+  "Everything is within its limits: do it again until it is a habit": "Alles ist in seinen Grenzen: mach es noch einmal, bis es sitzt", "Try it again, slowly; Show me shows how": "Versuche es noch einmal, langsam; Zeig es mir zeigt, wie",
   "Recording: {0}": "Aufnahme: {0}", "The recording is not in a file yet; it is kept while this page is open.": "Die Aufnahme ist noch in keiner Datei; sie bleibt, solange diese Seite offen ist.",
   // What the program says.
   "Success, after # s": "Geschafft, nach # s", "Failed: the time ran out, after # s": "Nicht geschafft: die Zeit war um, nach # s",
