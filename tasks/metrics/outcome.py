@@ -228,7 +228,7 @@ def tearing(torn: ArrayLike) -> float:
 
 @metric("Knot security", "N", "outcome", "all", "FLS tasks 4 and 5: security", better="neither")
 def knot_security(security: ArrayLike) -> float:
-  """Returns the pull on a slit that its knot has held closed [N], neither is better.
+  """Returns the pull on a slit that its knot has held [N], neither is better.
 
   Args:
     security: so far; 0 before the test [N]  (nstep,)

@@ -34,7 +34,9 @@ _SKIN, _MARGIN = 2.5e-4, 6e-4  # radius of the flex; of the thread's contacts, w
 _RGBA, _BLOCK = (0.86, 0.72, 0.42, 1.0), (0.022, 0.02, 0.003)
 HANDS, BLOCK = 8, 16  # bits of what meets instruments: the thread, and the block under the drain
 _SAMPLES = 4001  # of a section
-_NEAR = 0.002  # from a mark to the vertices that a test pulls at [m]
+# Of vertices that a test pulls at: from the mark, and nearer to the slit, at most [m]; the angle of
+# its pull over the table [rad].
+_NEAR, _EDGE, _LIFT = 0.002, 1e-4, 0.6
 SETTLES = 0.1  # see `Task`: the thread falls meanwhile, until it is laid [s]
 
 
@@ -140,7 +142,9 @@ def gap(places: np.ndarray, nodes: int) -> float:
 
 
 def part(organ: palpate.Organ, nodes: int, force: float) -> None:
-  """Pulls both sides of the slit apart at the marks, as a test of the knot, each with a force [N].
+  """Lifts the wall on both sides of the stitch and pulls it apart, as a test of the knot.
+
+  Pulled flat, the tube would collapse with a jump.
 
   Args:
     organ: the drain
@@ -153,5 +157,7 @@ def part(organ: palpate.Organ, nodes: int, force: float) -> None:
   body = model.flex_vertbodyid[model.flex_vertadr[flex] :][: len(rest)]
   for side in (-1.0, 1.0):
     mark = MIDDLE + np.array([0.5 * side * BITE, 0.0, 0.0])
-    near = body[np.linalg.norm(rest - mark, axis=1) < _NEAR]
-    data.xfrc_applied[near, 0] = side * force / len(near)
+    beyond = side * (rest[:, 0] - mark[0]) > -_EDGE  # the lips are not pulled
+    near = body[beyond & (np.linalg.norm(rest - mark, axis=1) < _NEAR)]
+    way = np.array([side * np.cos(_LIFT), 0.0, np.sin(_LIFT)])
+    data.xfrc_applied[near, :3] = force / len(near) * way
