@@ -5,7 +5,7 @@ import numpy as np
 import palpate.batch
 import pytest
 from devices import needs_cuda
-from scenes import RADIUS, load, organ, sphere, world
+from scenes import RADIUS, load, organ, probed, sphere, world
 
 DEVICES = [
   "warp-cpu",
@@ -189,3 +189,19 @@ def test_nodes_on_a_plane_that_have_no_slot_are_counted(device):
   batch.step()
   with pytest.warns(UserWarning, match="windows had no room"):
     assert (batch.overflow.numpy() > 0).all()
+
+
+def test_rows_of_contacts_that_were_are_forgotten():
+  """A contact may come where one with more rows has been: of other friction, or another world's."""
+  forces = []
+  for stale in (-1, 0):
+    spec = mujoco.MjSpec.from_string(probed(condim=3, cone="elliptic"))
+    spec.worldbody.add_geom(size=[0.01, 0, 0], pos=[1, 1, 1], condim=6)
+    batch = palpate.batch.make(spec, 1, "warp-cpu", deterministic=True)  # rows are sparse
+    for k in range(20):
+      batch.ctrl = np.array([[-0.001 * k, 0.0]])
+      batch.d.contact.efc_address.fill_(stale)
+      batch.step()
+    forces.append(batch.organ("organ").contact_force.numpy())
+  assert np.array_equal(*forces)
+  assert np.abs(forces[0]).max() > 1e-3

@@ -101,6 +101,7 @@ class Touch:
   out_worldid: ints("naconmax")
   out_type: ints("naconmax")
   out_geomcollisionid: ints("naconmax")
+  out_efc_address: ints("naconmax", "nrow")
 
 
 @wp.struct
@@ -172,6 +173,8 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
     c.out_worldid[k] = at.world
     c.out_type[k] = _CONSTRAINT
     c.out_geomcollisionid[k] = n
+    for row in range(c.out_efc_address.shape[1]):  # mujoco_warp gives it as many as it needs
+      c.out_efc_address[k, row] = -1
   return n + 1
 
 
