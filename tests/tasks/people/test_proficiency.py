@@ -86,8 +86,7 @@ def test_a_gentler_technique_than_the_experts_is_proficient():
 def test_every_exercise_has_a_panel_of_skilled_people(name):
   reference = score.reference(name)
   assert reference["performer"] == "skilled"
-  least = 0.75 if name == "suture/running_easy" else 0.8  # there wrists still run into the wall
-  assert reference["n"] >= least * reference["episodes"] and reference["episodes"] >= 12
+  assert reference["n"] >= 0.8 * reference["episodes"] and reference["episodes"] >= 12
 
 
 @pytest.mark.slow
