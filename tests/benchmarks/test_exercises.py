@@ -141,10 +141,12 @@ def test_learning_writes_table_and_curve(tmp_path):
 
 def test_what_was_kept_was_learned_from_nothing():
   found = learning.trainings(results.read(HERE / "results" / "learning.csv"))
-  assert {"touch/easy", "trace/easy"} <= set(found)
+  learned = {"touch/easy", "trace/easy", "probe/easy"}  # the page says which others were tried
+  assert learned <= set(found)
   for task, curves in found.items():
     for first, *_, last in curves:
-      assert first["success"] < 10 and last["judged"] >= 90, task
+      assert first["success"] < 10, task
+      assert task not in learned or last["judged"] >= 90, task
 
 
 def test_a_clone_does_what_was_done():
