@@ -20,8 +20,9 @@ import numpy as np
 import warp as wp
 
 NATIVE = pathlib.Path(__file__).parents[1] / "native"
-# Warp modules of the kernels by kind of device, in the order in which they were declared.
-MODULES: dict[str, list[str]] = {"cpu": [], "cuda": []}
+# Warp modules of the kernels by kind of device, in the order in which they were declared, and the
+# constants that any of their kernels knows.
+MODULES: dict[str, dict[str, dict[str, int | float]]] = {"cpu": {}, "cuda": {}}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +152,9 @@ def kernel(
 def _module(header: str, kind: str, constants: tuple, tag: str) -> str:
   """Declares the Warp module of a header for one kind of device and returns its name."""
   name = f"palpate.{kind}.{header.removesuffix('.h').replace('/', '.')}{tag}"
-  preamble = _constexpr(dict(constants)) + f'\n#include "{header}"\n'
+  known = MODULES[kind].setdefault(name, {})
+  known |= dict(constants)
+  preamble = _constexpr(known) + f'\n#include "{header}"\n'
   options = wp.ModuleBuildOptions(
     extra_cpu_include_dirs=[str(NATIVE)],
     extra_cuda_include_dirs=[str(NATIVE)],
@@ -160,8 +163,6 @@ def _module(header: str, kind: str, constants: tuple, tag: str) -> str:
     extra_build_dependencies=[str(NATIVE / each) for each in _includes(header)],
   )
   wp.set_module_options({"extra_build_options": options, "enable_backward": False}, name)
-  if name not in MODULES[kind]:
-    MODULES[kind].append(name)
   return name
 
 
