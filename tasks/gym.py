@@ -143,6 +143,7 @@ class Exercise(gymnasium.Env):
       for event in self._task.take_events():
         self._recorder.event(event.kind, event.time, event.value, event.instrument, event.label)
       if timestep.last():
+        self._recorder.info["outcome"] = outcome or "time limit"
         known = self._recorder.metrics().values()
         info["metrics"] = {k: float(v) for k, v in known.items() if math.isfinite(v)}
     if self.render_mode == "human":

@@ -142,6 +142,11 @@ class Inputs:
     return self.tip_pos is not None and not math.isnan(m.path_length(self.tip_pos))
 
   @property
+  def finished(self) -> bool:
+    """Whether the exercise succeeded, or nobody said how it ended."""
+    return self._recording.outcome in (None, m.SUCCESS)
+
+  @property
   def force_time(self) -> np.ndarray:
     """Times of the forces' samples, `substeps` for one of the others [s]."""
     return self._recording.signal_time

@@ -108,8 +108,8 @@ def _write(out: pathlib.Path, task: str, args: argparse.Namespace, results: list
   import mujoco
   from palpate.tasks import suite
   from palpate.tasks.files import replacing
-  from palpate.tasks.metrics import Metrics
-  from palpate.tasks.people.score import SUCCESS, make_reference, to_json
+  from palpate.tasks.metrics import SUCCESS, Metrics
+  from palpate.tasks.people.score import make_reference, to_json
 
   good = [Metrics.from_json(r.metrics) for r in results if r.outcome == SUCCESS]
   said = f"{task}: {len(good)} of {len(results)} episodes succeeded"

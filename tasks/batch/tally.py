@@ -194,6 +194,13 @@ def _share(part: wp.float64, whole: wp.float64):
 
 
 @wp.func
+def _inefficiency(s: Common, w: int, path: wp.float64):
+  """Returns by how much a path is longer than the task's, of one that was finished [%]."""
+  longer = 100.0 * (_share(path, wp.float64(s.reference[w])) - 1.0)
+  return wp.where(s.success[w], longer, wp.nan)
+
+
+@wp.func
 def _end(t: Tally, w: int, q: int):
   """Returns for how long less than a step the last force counts: ends count half [s]."""
   half = wp.float64(0.5) * t.h
@@ -225,7 +232,7 @@ def _tell(s: Common, t: Tally, w: int):
   t.values[w, M.contact_speed] = wp.where(met, float(t.rush[w]) / s.dt, wp.nan)
   side = wp.pow(size[0] * size[1] * size[2], 1.0 / 3.0)
   t.values[w, M.economy_of_volume] = _share(wp.float64(side), path)
-  t.values[w, M.path_inefficiency] = 100.0 * (_share(path, wp.float64(s.reference[w])) - 1.0)
+  t.values[w, M.path_inefficiency] = _inefficiency(s, w, path)
   t.values[w, M.depth_path] = wp.where(moved, float(t.depth[w]), wp.nan)
   t.values[w, M.angular_path] = wp.where(moved, float(t.turned[w]), wp.nan)
   t.values[w, M.response_orientation] = wp.where(moved, float(t.rolled[w]), wp.nan)
@@ -263,8 +270,7 @@ def join(s: Common, t: Tally, other: Tally, how: wp.array[int]):
   a, b = t.values[w, k], other.values[w, k]
   if how[k] > _MEAN:  # they are of the whole
     if k == M.path_inefficiency:
-      path = t.path[w] + other.path[w]
-      t.values[w, k] = 100.0 * (_share(path, wp.float64(s.reference[w])) - 1.0)
+      t.values[w, k] = _inefficiency(s, w, t.path[w] + other.path[w])
   elif wp.isnan(a) or wp.isnan(b):
     t.values[w, k] = wp.where(wp.isnan(a), b, a)
   elif how[k] == _MAX:

@@ -96,7 +96,7 @@ def economy_of_volume(tip_pos: ArrayLike) -> float:
 
 
 @metric("Path inefficiency", "%", "efficiency", "all", "Perk Tutor; 10.1007/s00464-007-9526-z")
-def path_inefficiency(path_length: float, reference_length: float) -> float:
+def path_inefficiency(path_length: float, reference_length: float, finished: bool = True) -> float:
   """Returns 100 (path_length / reference_length - 1) [%], lower is better (Perk Tutor).
 
   The reference is the task's own path, not the straight line (10.1007/s00464-007-9526-z).
@@ -104,8 +104,11 @@ def path_inefficiency(path_length: float, reference_length: float) -> float:
   Args:
     path_length: of all instruments together [m]
     reference_length: length of the path that the task asks for [m]
+    finished: whether the task was done; of one that was not, the path is a part
   """
   _moved(path_length)
+  if not finished:
+    raise UnknownError("the exercise was not finished")
   if not reference_length > 0:
     raise UnknownError("no reference length")
   return 100 * (path_length / reference_length - 1)

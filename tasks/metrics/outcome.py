@@ -12,6 +12,7 @@ from .definition import UnknownError, metric
 from .samples import rows, same
 
 EVENTS = ("target", "miss", "drop", "unintended_contact", "slip", "note")
+SUCCESS = "success"  # how an exercise ends that was done
 ERRORS = ("miss", "drop", "unintended_contact")
 
 

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from ..metrics import METRICS, Metrics, Spec, number
+from ..metrics import METRICS, SUCCESS, Metrics, Spec, number
 from ..recording import Recording
 from . import page
 from .page import text
 from .plots import compared_figure, path_figure, png
 from .report import ending, verdict, views, write_page
-from .score import SUCCESS, WEIGHTS, Score, score
+from .score import WEIGHTS, Score, score
 
 
 @dataclasses.dataclass(frozen=True)

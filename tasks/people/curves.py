@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..metrics import METRICS, Metrics, number
+from ..metrics import METRICS, SUCCESS, Metrics, number
 from . import cusum
 from .plots import blank, legend_above, tidy
-from .score import FLOOR, SUCCESS
+from .score import FLOOR, tells
 
 if TYPE_CHECKING:
   from matplotlib.figure import Figure
@@ -126,7 +126,9 @@ def _draw_metric(
   ax: Any, attempts: Sequence[Attempt], name: str, reference: Mapping[str, Any] | None
 ) -> None:
   spec = METRICS[name]
-  values = np.array([spec.scale * getattr(a.metrics, name) for a in attempts], float)
+  values = np.array([
+    spec.scale * getattr(a.metrics, name) if tells(spec, a.outcome) else math.nan for a in attempts
+  ])  # fmt: skip
   row = reference["metrics"].get(name) if reference else None
   if row is not None:
     ax.axhline(

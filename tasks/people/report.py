@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 
 from ..files import replacing
-from ..metrics import METRICS, Metrics, Spec, Unknown, number
+from ..metrics import METRICS, SUCCESS, Metrics, Spec, Unknown, number
 from ..recording import INTERRUPTED, Recording
 from . import page
 from .page import text
 from .plots import force_figure, jpeg, path_figure, png, spectrum_figure
-from .score import CONSECUTIVE, FLOOR, PASSING, REPEATS, SUCCESS, WEIGHTS, Score, score
+from .score import CONSECUTIVE, FLOOR, PASSING, REPEATS, WEIGHTS, Score, score
 
 _MOST_EVENTS = 50
+_ABOUT = {"task_kwargs": "options", "return": "sum of rewards"}  # names of entries, for people
 _ENDS = {
   SUCCESS: "Success",
   "damage": "Failed: tissue was harmed",
@@ -278,7 +279,7 @@ def _event_table(recording: Recording) -> str:
 
 def _about(recording: Recording, reference: Mapping[str, Any] | None) -> str:
   set_ = recording.settings
-  lines: dict[str, Any] = {key: value for key, value in recording.info.items() if value != ""}
+  lines = {_ABOUT.get(k, k): v for k, v in recording.info.items() if v not in ("", {})}
   if "coach" in lines:
     said = [f"{hint['time']:.1f} s: {hint['text']}" for hint in lines["coach"].get("hints", ())]
     lines["coach"] = "; ".join(said) or "silent"
@@ -302,5 +303,14 @@ def _about(recording: Recording, reference: Mapping[str, Any] | None) -> str:
   if reference is not None:
     keys = ("task", "performer", "n", "seed", "palpate")
     lines["reference"] = ", ".join(f"{k} {reference[k]}" for k in keys if k in reference)
-  items = "".join(f"<dt>{text(k)}</dt><dd>{text(v)}</dd>" for k, v in lines.items())
+  items = "".join(f"<dt>{text(k)}</dt><dd>{text(_plain(v))}</dd>" for k, v in lines.items())
   return f"<h2>About</h2><dl class='small'>{items}</dl>"
+
+
+def _plain(value: Any) -> str:
+  """Returns what JSON holds, for people."""
+  if isinstance(value, Mapping):
+    return "; ".join(f"{k} = {_plain(v)}" for k, v in value.items())
+  if isinstance(value, list | tuple):
+    return ", ".join(map(_plain, value))
+  return "none" if value is None else str(value)

@@ -1,7 +1,8 @@
 """The score of a recording against skilled performers, the outcome first.
 
 An exercise that did not succeed scores `FLOOR`, whatever its metrics: a short path is no merit of a
-hand that stopped. It is below every score of a success, and it is never proficient.
+hand that stopped. It is below every score of a success, and it is never proficient. Its time and
+its efficiency are neither compared nor limited (`tells`).
 
 A reference is plain data, so that it ships as JSON:
 
@@ -53,7 +54,7 @@ from typing import Any
 
 import numpy as np
 
-from ..metrics import METRICS, Metrics, Unknown, check_header, check_names
+from ..metrics import METRICS, SUCCESS, Metrics, Spec, Unknown, check_header, check_names
 
 WEIGHTS = {
   "safety": 0.67,
@@ -71,7 +72,6 @@ MARGIN = 0.05
 _NINTH = 1.2816  # normal deviate that 90 % are under
 CONSECUTIVE, REPEATS = 2, 10
 LEAST_WEIGHT = 0.5
-SUCCESS = "success"
 _VERSION = 2
 
 
@@ -269,6 +269,11 @@ def _as_good(value: float, other: float, better: str, margin: float = 1e-9) -> b
   return _ahead(value, other, better) >= -margin * max(abs(value), abs(other))
 
 
+def tells(spec: Spec, outcome: str | None) -> bool:
+  """Returns whether a metric tells of skill: what ends early is quick and short without merit."""
+  return outcome in (None, SUCCESS) or spec.group not in ("efficiency", "time")
+
+
 def score(
   metrics: Metrics,
   reference: Mapping[str, Any],
@@ -293,6 +298,9 @@ def score(
   z, over, missing = {}, [], []
   for name, row in reference["metrics"].items():
     value, better = getattr(metrics, name), METRICS[name].better
+    if not tells(METRICS[name], outcome):
+      z[name] = Unknown("the exercise was not finished")
+      continue
     z[name] = z_score(value, row["mean"], row.get("sd"), better)
     if not math.isfinite(value):
       if row.get("n") == reference.get("n"):

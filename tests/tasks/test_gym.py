@@ -123,6 +123,7 @@ def test_vectors_and_the_end_of_an_episode():
     _, reward, terminated, truncated, info = envs.step(np.zeros((2, 4)))
   assert truncated.all() and not terminated.any() and reward.shape == (2,)
   assert "time" in info["metrics"]
+  assert "path_inefficiency" not in info["metrics"]  # of a part of the path
   envs.close()
 
 

@@ -7,9 +7,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from palpate.tasks.metrics import METRICS, Spec, number
+from palpate.tasks.metrics import METRICS, SUCCESS, Spec, number
 from palpate.tasks.people.report import ending
-from palpate.tasks.people.score import SUCCESS, Score, score
+from palpate.tasks.people.score import Score, score, tells
 from palpate.tasks.recording import Recording
 
 _STAYS = 0.6  # how long a warning is shown [s]
@@ -122,11 +122,6 @@ def _shown(value: float, spec: Spec) -> str:
   return "0" if "e\N{MINUS SIGN}" in text else text
 
 
-def _tells(spec: Spec, recording: Recording) -> bool:
-  """Returns whether a metric is meaningful: an exercise that ends early is quick without merit."""
-  return recording.outcome == SUCCESS or spec.group not in ("efficiency", "time")
-
-
 def _words(text: str) -> str:
   return "".join(c for c in text if not c.isdigit() and c != ".")
 
@@ -151,11 +146,10 @@ def judge(recording: Recording, reference: Mapping[str, Any] | None) -> Judged:
   if reference is None or not len(recording.time):
     return Judged(None)
   result = score(recording.metrics(), reference, recording.outcome)
-  over = [name for name in result.over if _tells(METRICS[name], recording)]
   good = []
   if recording.outcome == SUCCESS:
     good = [k for k, z in result.z.items() if math.isfinite(z) and z > 0.5 and k not in result.over]
-  better = sorted(over, key=lambda name: result.z[name])
+  better = sorted(result.over, key=lambda name: result.z[name])
   return Judged(result, tuple(better), tuple(sorted(good, key=lambda name: -result.z[name])))
 
 
@@ -190,7 +184,7 @@ def card(recording: Recording, reference: Mapping[str, Any] | None) -> dict[str,
   rows = [
     _row(name, recording, known) | {"over": result is not None and name in result.over}
     for name, spec in METRICS.items()
-    if math.isfinite(getattr(metrics, name)) and _tells(spec, recording)
+    if math.isfinite(getattr(metrics, name)) and tells(spec, recording.outcome)
   ]
   score_of = result.composite if done and result is not None else math.nan
   helps = dict.fromkeys(_help(name, recording) for name in judged.better)

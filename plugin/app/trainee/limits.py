@@ -35,7 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser):
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
   from palpate.tasks.files import replacing
-  from palpate.tasks.people import limits, score
+  from palpate.tasks.metrics import SUCCESS
+  from palpate.tasks.people import limits
 
   if not args.recordings and not args.trainee:
     raise CommandError("no FILE and no --trainee to make limits of")
@@ -45,7 +46,7 @@ def main(args: argparse.Namespace) -> int:
   with keeping.one_line():
     limits.rule(args.rule)
     for task, outcome, metrics in [*_of_files(args), *_of_people(args)]:
-      found.setdefault(task, []).extend([metrics] if outcome == score.SUCCESS else [])
+      found.setdefault(task, []).extend([metrics] if outcome == SUCCESS else [])
     for task, results in sorted(found.items()):
       try:
         made[task] = limits.of_people(results, task, args.rule) | {"palpate": palpate.__version__}

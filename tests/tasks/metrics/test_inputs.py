@@ -1,5 +1,6 @@
 """The metrics of a recording, and how a new one comes to be."""
 
+import dataclasses
 import json
 import math
 
@@ -88,6 +89,15 @@ def test_metrics_of_a_straight_line():
   assert reasons["target_error"] == "no target was touched"
   assert reasons["trace_rms"] == reasons["trace_frechet"] == "no curve to trace"
   assert reasons["bimanual_dexterity"] == "a single instrument"
+
+
+@pytest.mark.parametrize("outcome", ["time limit", "stopped", "damage"])
+def test_the_path_of_what_was_not_finished_is_not_compared_with_the_whole(outcome):
+  made = dataclasses.replace(plain(LINE).recording(), info={"outcome": outcome}).metrics()
+  assert made.reasons()["path_inefficiency"] == "the exercise was not finished"
+  assert made.path_length == pytest.approx(0.12)
+  done = dataclasses.replace(plain(LINE).recording(), info={"outcome": "success"}).metrics()
+  assert done.path_inefficiency == pytest.approx(20)
 
 
 def test_metrics_agree_with_the_functions():

@@ -218,6 +218,9 @@ def test_what_a_live_exercise_has_noted_is_told_in_words():
   recorder.info["live"] = {"on_time": 0.998, "steps": 2000, "faults": ["udp: it is gone"]}
   text = _Page(report.render(recorder.recording())).text()
   assert "coach 1.5 s: Press less live 99.8 % of 2000 steps on time; udp: it is gone" in text
+  recorder.info["task_kwargs"] = {"observations": ["joints", "target"], "radius": 0.006}
+  text = _Page(report.render(recorder.recording())).text()
+  assert "options observations = joints, target; radius = 0.006" in text
 
 
 def test_the_head_says_what_harmed_tissue():

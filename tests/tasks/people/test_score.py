@@ -195,6 +195,10 @@ def test_what_did_not_succeed_scores_the_floor(outcome):
   failed = score(best, reference, outcome)
   assert failed.composite == scoring.FLOOR < worst.composite == -10
   assert not failed.proficient and failed.over == ()
+  slow = score(Metrics(time=1e9, path_length=1e9, peak_force=1e9), reference, outcome)
+  assert slow.over == ("peak_force",)  # a time or a path that broke off is not compared
+  for name in ("time", "path_length"):
+    assert "not finished" in failed.z[name].reason and name not in failed.missing
   assert score(Metrics(), reference, outcome).composite == scoring.FLOOR  # nothing is known
   assert score(best, reference, SUCCESS).proficient
 
