@@ -318,7 +318,7 @@ def pay(part: dict, scale: float, threshold: float) -> bool:
 
   Not on a membrane: contact moves it where it is touched, and block Jacobi takes at most ten times
   the cycles, warm half of that, from 678 to 262,146 nodes and from 3 kPa to 3 MPa
-  (`palpate bench preconditioner`), while a cycle takes as long as eight iterations and more.
+  (results/development/preconditioner.md), while a cycle takes as long as eight iterations and more.
 
   Args:
     part: fields of the mesh, see `shape.arrays`

@@ -19,11 +19,9 @@ BENCHES = {
   "experts": "how many of its episodes each expert solves; the references",
   "flex": "batches beside mujoco_warp's own flex on the same device",
   "flicker": "steps without force while a probe presses the organs that ship",
-  "inertia": "what the effective inertia does to the contact force",
   "knots": "threads in knots: does anything go through, what holds, what edges cost",
   "learning": "what an agent learns of the exercises from random weights",
   "live": "how punctual a live loop is while a page shows it, and how late its pictures are",
-  "locality": "what leaving out solved nodes would save",
   "loop": "the whole loop, mj_step with a probe on a windowed organ",
   "loopholes": "what a search finds in the exercises that does not do the work",
   "native": "settings of MuJoCo's native flex beside each other",
@@ -31,10 +29,7 @@ BENCHES = {
   "peer": "run time against error, beside MuJoCo's native flex, tolerance by tolerance",
   "pictures": "pictures a second in many worlds, beside mujoco_warp's renderer",
   "policies": "success of the policies that ship",
-  "preconditioner": "iterations with block Jacobi and multilevel",
-  "press_error": "what is left of the press's force error",
   "rest": "a sleeping organ against none",
-  "second_order": "schemes of second order, in float64",
   "skill": "metrics: expert against novices",
   "skipping": "what switching each feature off saves",
   "solver": "the implicit step alone, device by device",
@@ -42,7 +37,6 @@ BENCHES = {
   "stability": "where each scheme breaks, over a thousand runs",
   "thesis": "the tables and figures of the thesis, measured today",
   "truth": "organ forces against closed forms, other finite elements and published measurements",
-  "uncut": "steps of organs that are never cut, beside an older state of the code",
 }
 
 

@@ -45,7 +45,6 @@ class Bench:
     file: name of the CSV, if not `name`; "{device}" in it is the kind of device of the options
     jobs: processes unless `--jobs` says otherwise; 0 is this one, where a case that fails ends all
     limit: seconds after which a case in a process of its own is given up and noted as such
-    folder: where results of the full form go, below `results`
   """
 
   name: str
@@ -58,7 +57,6 @@ class Bench:
   file: str = ""
   jobs: int = 0
   limit: float = 600.0
-  folder: str = ""
 
   def path(self, args: argparse.Namespace) -> pathlib.Path:
     """Returns the path of the CSV."""
@@ -92,9 +90,7 @@ def options(bench: Bench, words: list[str]) -> argparse.Namespace:
   args = parser.parse_args(words)
   if args.jobs < 0:
     raise CommandError(f"jobs is {args.jobs}, expected a number >= 0")
-  args.out = args.out or (
-    pathlib.Path("out", "bench") if args.short else results.FOLDER / bench.folder
-  )
+  args.out = args.out or (pathlib.Path("out", "bench") if args.short else results.FOLDER)
   return args
 
 

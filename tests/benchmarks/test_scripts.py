@@ -62,24 +62,6 @@ def test_loop_touches_says_where_time_goes_and_sleeps(tmp_path):
   assert all(line.count("|") == head.count("|") for line in table)
 
 
-@pytest.mark.parametrize(
-  ("name", "words"),
-  [
-    ("inertia", ()),
-    ("press_error", ()),
-    ("locality", ("--steps", 48)),
-    ("preconditioner", ("--nodes", 162, "--young", 3e4)),
-    pytest.param("second_order", (), marks=pytest.mark.slow),
-  ],
-)
-def test_short_forms_write_rows_and_a_page(tmp_path, name, words):
-  assert command(name, "--short", *words, "-o", tmp_path) == 0
-  rows = results.read(tmp_path / f"{name}.csv")
-  assert rows and all(row["status"] == "ok" for row in rows)
-  page = (tmp_path / f"{name}.md").read_text()
-  assert f"palpate bench {name} --short" in page and page.count("|") >= 12
-
-
 def test_another_python_takes_the_same_steps():
   keys = {"kind": "solid", "nodes": 42, "side": "peer", "h": 4e-3, "tolerance": 1e-8}
   here = peer.Run(**keys)
