@@ -13,7 +13,6 @@ FOLDER = pathlib.Path(__file__).parent
 BENCHES = {
   "attacks": "what random attacks break",
   "batch": "world-steps a second of batches, and what a world takes",
-  "cloning": "behaviour cloning: success over the number of demonstrations",
   "cut": "steps in which an organ is cut, beside steps in contact",
   "error": "run time against error, beside MuJoCo's own flex",
   "experts": "how many of its episodes each expert solves; the references",

@@ -7,10 +7,9 @@ import sys
 import numpy as np
 import pytest
 from benchmarks import results
-from benchmarks.exercises import cloning, experts, learning, loopholes, skill
+from benchmarks.exercises import experts, learning, loopholes, skill
 from palpate.app import cli, panel
 from palpate.tasks.core import performer
-from palpate.tasks.learn import policy
 from palpate.tasks.people import score
 
 HERE = pathlib.Path(__file__).parent
@@ -147,15 +146,3 @@ def test_what_was_kept_was_learned_from_nothing():
     for first, *_, last in curves:
       assert first["success"] < 10, task
       assert task not in learned or last["judged"] >= 90, task
-
-
-def test_a_clone_does_what_was_done():
-  pytest.importorskip("sklearn")
-  seen = np.random.RandomState(0).normal(size=(4000, 2)) * [1.0, 1e-3] + [5.0, 0.0]
-  done = np.stack([np.tanh(seen[:, 0] - 5), 300 * seen[:, 1]], axis=1).clip(-1, 1)
-  about = policy.About("touch/standard", ["pitch", "yaw"], ["a", "b"], 0.02)
-  made, loss = cloning.learn(seen, done, about, epochs=20)
-  assert loss < 0.01
-  act = made.begin()
-  some = np.array([act({"a": row[:1], "b": row[1:]}) for row in seen[:200]])
-  assert np.abs(some - done[:200]).mean() < 0.1
