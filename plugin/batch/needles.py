@@ -2,75 +2,44 @@
 
 # pyright: reportInvalidTypeForm=false
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
-import warp as wp
 from palpate.engine.coupling import CONSTANTS
 from palpate.engine.layout import HOLES
 from palpate.forces import needles
 from palpate.forces.host import for_worlds
 from palpate.tissue.kernels import kernel
-from palpate.tissue.types import allocate, floats, ints, struct
-
-
-class Needles(NamedTuple):
-  """Needles of an organ in all worlds, in the order of its key `needles`.
-
-  Of holes there is room for 20, the first made first; those from `count` on are of no use.
-
-  Attributes:
-    touches: 1 where its tip is pressed on a surface                          (nworld, n)
-    inside: 1 where its tip is in a solid                                     (nworld, n)
-    force: of the whole needle on the organ in the last step [N]           (nworld, n, 3)
-    tip_force: that of its tip [N]                                         (nworld, n, 3)
-    energy: that piercing and cutting have taken [J]                          (nworld, n)
-    count: its holes                                                          (nworld, n)
-    hole_inside: 1 where a hole is a point inside of a solid              (nworld, n, 20)
-    hole_thread: 1 where the needle's thread is in it                     (nworld, n, 20)
-    hole_at: where it is now [m]                                       (nworld, n, 20, 3)
-    hole_rest: the same at rest [m]                                    (nworld, n, 20, 3)
-    hole_along: where along the needle, see `Pinhole` [m]                 (nworld, n, 20)
-    hole_force: on the organ in the last step [N]                      (nworld, n, 20, 3)
-    hole_torn: how far it has torn through the tissue [m]                 (nworld, n, 20)
-  """
-
-  touches: wp.array
-  inside: wp.array
-  force: wp.array
-  tip_force: wp.array
-  energy: wp.array
-  count: wp.array
-  hole_inside: wp.array
-  hole_thread: wp.array
-  hole_at: wp.array
-  hole_rest: wp.array
-  hole_along: wp.array
-  hole_force: wp.array
-  hole_torn: wp.array
-
-
-_OF_HOLES = [name for name in Needles._fields if name.startswith("hole_")]
-_OF_NEEDLES = ("touches", "inside", "force", "tip_force", "energy")
+from palpate.tissue.types import allocate, floats, ints, struct, tuple_of
 
 
 @struct
 class ToldNeedles:
-  """Arrays of `Needles`."""
+  """Needles of an organ in all worlds, in the order of its key `needles`.
 
-  touches: floats("nworld", "nneedle")
-  inside: floats("nworld", "nneedle")
-  force: floats("nworld", "nneedle", 3)
-  tip_force: floats("nworld", "nneedle", 3)
-  energy: floats("nworld", "nneedle")
-  count: ints("nworld", "nneedle")
-  hole_inside: floats("nworld", "nneedle", HOLES)
-  hole_thread: floats("nworld", "nneedle", HOLES)
-  hole_at: floats("nworld", "nneedle", HOLES, 3)
-  hole_rest: floats("nworld", "nneedle", HOLES, 3)
-  hole_along: floats("nworld", "nneedle", HOLES)
-  hole_force: floats("nworld", "nneedle", HOLES, 3)
-  hole_torn: floats("nworld", "nneedle", HOLES)
+  Of holes there is room for 20, the first made first; those from `count` on are of no use.
+  """
+
+  touches: floats("nworld", "nneedle")  # 1 where its tip is pressed on a surface
+  inside: floats("nworld", "nneedle")  # 1 where its tip is in a solid
+  force: floats("nworld", "nneedle", 3)  # of the whole needle on the organ in the last step [N]
+  tip_force: floats("nworld", "nneedle", 3)  # that of its tip [N]
+  energy: floats("nworld", "nneedle")  # that piercing and cutting have taken [J]
+  count: ints("nworld", "nneedle")  # its holes
+  hole_inside: floats("nworld", "nneedle", HOLES)  # 1 where a hole is a point inside of a solid
+  hole_thread: floats("nworld", "nneedle", HOLES)  # 1 where the needle's thread is in it
+  hole_at: floats("nworld", "nneedle", HOLES, 3)  # where it is now [m]
+  hole_rest: floats("nworld", "nneedle", HOLES, 3)  # the same at rest [m]
+  hole_along: floats("nworld", "nneedle", HOLES)  # where along the needle, see `Pinhole` [m]
+  hole_force: floats("nworld", "nneedle", HOLES, 3)  # on the organ in the last step [N]
+  hole_torn: floats("nworld", "nneedle", HOLES)  # how far it has torn through the tissue [m]
+
+
+class Needles(tuple_of(ToldNeedles)):
+  """The arrays of `ToldNeedles`."""
+
+
+_OF_HOLES = [name for name in ToldNeedles.vars if name.startswith("hole_")]
+_OF_NEEDLES = ("touches", "inside", "force", "tip_force", "energy")
 
 
 @struct
@@ -103,13 +72,13 @@ class Shown:
     """Returns what they do."""
     host = self._force.host
     _tell.launch(host.device, host.nworld, 1, 0, self._telling, 32)
-    return _as_tuple(self._telling.told)
+    return Needles.of(self._telling.told)
 
 
 def gathered(every: Sequence[tuple[needles.Needle, ...]]) -> Needles:
   """Returns arrays of what the needles of each world do."""
   told = allocate(ToldNeedles, "cpu", {"nworld": len(every), "nneedle": len(every[0])})
-  out = {name: getattr(told, name).numpy() for name in Needles._fields}
+  out = {name: getattr(told, name).numpy() for name in ToldNeedles.vars}
   for at in np.ndindex(out["count"].shape):
     needle = every[at[0]][at[1]]
     for name in _OF_NEEDLES:
@@ -118,8 +87,4 @@ def gathered(every: Sequence[tuple[needles.Needle, ...]]) -> Needles:
     for k, hole in enumerate(needle.holes):
       for name in _OF_HOLES:
         out[name][(*at, k)] = getattr(hole, name.removeprefix("hole_"))
-  return _as_tuple(told)
-
-
-def _as_tuple(told) -> Needles:
-  return Needles(*(getattr(told, name) for name in Needles._fields))
+  return Needles.of(told)

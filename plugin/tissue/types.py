@@ -7,6 +7,7 @@ bending), ntetslice of tetrahedra (0 but for solids); nslot rows of stiffness bl
 axis; `core/simd.h` says how they are read.
 """
 
+import collections
 import dataclasses
 import enum
 from typing import Any
@@ -71,6 +72,13 @@ def struct(cls) -> Any:
     name: wp.array(dtype=kind.dtype, ndim=len(kind.dims)) for name, kind in arrays.items()
   }
   return wp.struct(cls)
+
+
+def tuple_of(kind: Any) -> Any:
+  """Returns a named tuple of a struct's fields; its `of` makes one of what a struct has there."""
+  made = collections.namedtuple(f"Of{kind.__name__}", kind.vars)
+  made.of = classmethod(lambda cls, told: cls(*(getattr(told, name) for name in cls._fields)))
+  return made
 
 
 class Stage(enum.IntEnum):

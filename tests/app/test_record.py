@@ -30,11 +30,11 @@ WRITER = """
 import sys, pathlib
 sys.path[:0] = {path!r}
 from test_record import KNOWN, Record, Session, made
-with Record(pathlib.Path({folder!r}), KNOWN) as record:
-  person, session = record.add({name!r}), Session()
-  for k in range({count}):
-    record.keep(person, made(k), session, KNOWN)
-    print(k, flush=True)
+record = Record(pathlib.Path({folder!r}), KNOWN)
+person, session = record.add({name!r}), Session()
+for k in range({count}):
+  record.keep(person, made(k), session, KNOWN)
+  print(k, flush=True)
 """
 
 
@@ -59,14 +59,14 @@ def folder(tmp_path, monkeypatch):
 
 def fill(folder, name, count=3, **info):
   """Keeps some recordings of a person, of one session."""
-  with Record(folder, KNOWN) as record:
-    person, session = record.add(name), Session()
-    return [record.keep(person, made(k, **info), session, KNOWN) for k in range(count)]
+  record = Record(folder, KNOWN)
+  person, session = record.add(name), Session()
+  return [record.keep(person, made(k, **info), session, KNOWN) for k in range(count)]
 
 
 def episodes(folder, name):
-  with Record(folder) as record:
-    return record.episodes(record.find(name))
+  record = Record(folder)
+  return record.episodes(record.find(name))
 
 
 def everything(folder):
@@ -126,8 +126,8 @@ def test_any_name_is_a_name_and_no_path(folder, name, capsys):
   allowed = r"recordings(/[0-9a-f]{32}(/(trainee\.json|\d{17}_touch_easy\.npz))?)?"
   assert all(re.fullmatch(allowed, path) for path in inside), inside
   assert cli.main(["trainee", "delete", "--yes", "--", name]) == 0
-  with Record(folder) as record:
-    assert [p.name for p in record.trainees()] == ["somebody else"]
+  record = Record(folder)
+  assert [p.name for p in record.trainees()] == ["somebody else"]
 
 
 @pytest.mark.parametrize("name", ["", "  ", "a\nb", "a\0b", "x" * 81, None, 3])
@@ -158,8 +158,8 @@ def test_deletion_leaves_nothing(folder, capsys):
   name = "Grace-Hopper-Ω"
   fill(folder, name, 6)
   kept = fill(folder, "Ada", 2)
-  with Record(folder) as record:
-    ident = record.find(name).id
+  record = Record(folder)
+  ident = record.find(name).id
   said = say(capsys, "trainee", "delete", name, code=2)
   assert "6 episodes" in said and "nothing is deleted without --yes" in said
   said = say(capsys, "trainee", "delete", name, "--yes")
@@ -173,8 +173,8 @@ def test_deletion_leaves_nothing(folder, capsys):
 
 def test_deletion_says_where_something_is_left(folder, capsys):
   fill(folder, "Ada", 1)
-  with Record(folder) as record:
-    (folder / "notes.txt").write_text(record.find("Ada").id)
+  record = Record(folder)
+  (folder / "notes.txt").write_text(record.find("Ada").id)
   said = say(capsys, "trainee", "delete", "Ada", "--yes", code=1)
   assert "notes.txt: still has data of 'Ada'" in said
 
@@ -214,8 +214,8 @@ def test_a_kill_in_the_middle_of_a_write_loses_nothing_that_was_committed(folder
   said = [int(line) for line in process.stdout.read().split()]
   process.wait()
   last = max(said, default=12)
-  with Record(folder, KNOWN) as record:
-    done = record.episodes(record.find("Ada"))
+  record = Record(folder, KNOWN)
+  done = record.episodes(record.find("Ada"))
   assert [e.seed for e in done[: last + 1]] == list(range(last + 1))
   assert len(done) <= last + 2
   for episode in done:
@@ -246,10 +246,10 @@ def test_a_record_is_its_recordings_and_reads_no_samples_to_list_them(folder, ca
 
 def test_limits_of_later_do_not_change_what_was_kept(folder):
   fill(folder, "Ada", 1)
-  with Record(folder, lambda task: None) as record:
-    (kept,) = record.episodes(record.find("Ada"))
-    made(1).save((folder / kept.path).with_name("z.npz"))  # by nobody's limits yet
-    _, other = record.episodes(record.find("Ada"))
+  record = Record(folder, lambda task: None)
+  (kept,) = record.episodes(record.find("Ada"))
+  made(1).save((folder / kept.path).with_name("z.npz"))  # by nobody's limits yet
+  _, other = record.episodes(record.find("Ada"))
   assert kept.score is not None and other.score is None
 
 
@@ -297,22 +297,22 @@ def test_a_foreign_recording_is_named_and_harms_nothing(folder):
   odd = {"coach": {"hints": 5}, "record": {"session": first.session, "ended": 3}, "task": None}
   made(7, **odd).save(place / "odd.npz")
   (folder / "recordings" / "notes").mkdir()
-  with Record(folder, KNOWN) as record:
-    bo = record.add("Bo")
-    made(8, record={"session": first.session}).save(folder / "recordings" / bo.id / "theirs.npz")
-  with Record(folder, KNOWN) as record:
-    assert [e.seed for e in record.episodes(record.find("Ada"))] == [0, 1, 7]
-    assert [text for text in record.said if "broken.npz: not counted" in text]
-    (other,) = record.episodes(record.find("Bo"))
-    assert other.seed == 8
+  record = Record(folder, KNOWN)
+  bo = record.add("Bo")
+  made(8, record={"session": first.session}).save(folder / "recordings" / bo.id / "theirs.npz")
+  record = Record(folder, KNOWN)
+  assert [e.seed for e in record.episodes(record.find("Ada"))] == [0, 1, 7]
+  assert [text for text in record.said if "broken.npz: not counted" in text]
+  (other,) = record.episodes(record.find("Bo"))
+  assert other.seed == 8
 
 
 def test_a_page_shows_what_was_typed_as_text(folder, capsys, tmp_path):
   pytest.importorskip("matplotlib")
   name = "<script>alert('x')</script> & $\\frac{1"
   fill(folder, name, 2, task="touch/<b>easy</b>")
-  with Record(folder, KNOWN) as record:
-    record.add("nothing yet")
+  record = Record(folder, KNOWN)
+  record.add("nothing yet")
   say(capsys, "trainee", "show", name, "-o", "a.html")
   page = (tmp_path / "a.html").read_text()
   assert "<script" not in page and "<b>easy" not in page and "&lt;script&gt;" in page
@@ -336,11 +336,11 @@ def test_what_the_coach_said_and_errors(folder):
   coach = {"assessment": False, "hints": [{"kind": "instruction"}] * 3}
   (first,) = fill(folder, "Ada", 1, coach=coach)
   assert (first.assessment, first.hints) == (False, 3)
-  with Record(folder, KNOWN) as record:
-    person = record.find("Ada")
-    record.keep(person, made(1, outcome="error"), Session(), KNOWN)
-    broken = dataclasses.replace(made(2), info={"task": 3, "seed": "x", "coach": "y"})
-    last = record.keep(person, broken, Session(), KNOWN)
+  record = Record(folder, KNOWN)
+  person = record.find("Ada")
+  record.keep(person, made(1, outcome="error"), Session(), KNOWN)
+  broken = dataclasses.replace(made(2), info={"task": 3, "seed": "x", "coach": "y"})
+  last = record.keep(person, broken, Session(), KNOWN)
   assert (last.task, last.seed, last.outcome) == ("3", None, "not recorded")
   kept = keeping.Keeping(folder, "Ada").begin().keep(made(5))
   assert kept.said[0].startswith("Attempt 2 at touch/easy")  # an error is no attempt

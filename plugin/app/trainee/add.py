@@ -17,7 +17,8 @@ def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
   from .record import Record
 
-  with keeping.one_line(), Record(keeping.folder(args), keeping.references(None)) as record:
+  with keeping.one_line():
+    record = Record(keeping.folder(args), keeping.references(None))
     keeping.tell(record)
     for name in args.names:
       known = record.trainees()

@@ -25,15 +25,15 @@ def main(args: argparse.Namespace) -> int:
 
   folder = keeping.folder(args)
   with keeping.one_line():
-    with Record(folder) as record:  # which makes no record where there is none
-      person = record.find(args.name)
-      count = len(record.episodes(person))
+    record = Record(folder)  # which makes no record where there is none
+    person = record.find(args.name)
+    count = len(record.episodes(person))
     if not args.yes:
       raise CommandError(
         f"{person.name!r} has {count} episodes in {str(folder)!r}; nothing is deleted without --yes"
       )
-    with Record(folder, keeping.references(None)) as record:
-      keeping.tell(record)
-      gone = record.delete(person)
+    record = Record(folder, keeping.references(None))
+    keeping.tell(record)
+    gone = record.delete(person)
   print(f"deleted {person.name!r}: {', '.join(gone)}; no file of {folder} has any of it left")
   return 0

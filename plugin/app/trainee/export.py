@@ -46,7 +46,8 @@ def main(args: argparse.Namespace) -> int:
   out = pathlib.Path(args.out)
   if out.exists():
     raise CommandError(f"out is {args.out!r}, which is there already")
-  with keeping.one_line(), Record(keeping.folder(args)) as record:
+  with keeping.one_line():
+    record = Record(keeping.folder(args))
     person = record.find(args.name)
     if args.anonymous:
       named = dataclasses.replace(person, name="")

@@ -145,8 +145,8 @@ class Keeping:
 
     if self.folder is None or not self.trainee:
       return None
-    with Record(self.folder) as record:
-      return history.passed(record.episodes(record.find(self.trainee)))
+    record = Record(self.folder)
+    return history.passed(record.episodes(record.find(self.trainee)))
 
   def knows(self, person: str) -> bool:
     """Returns whether what a person did goes to a record; a trainee does everything."""
@@ -243,9 +243,9 @@ class Sitting:
     from .record import Record
 
     assert self.keeping.folder is not None
-    with Record(self.keeping.folder, self.references) as record:
-      trainee = self.keeping.trainee
-      yield record, record.find(trainee) if trainee else record.add(person)
+    record = Record(self.keeping.folder, self.references)
+    trainee = self.keeping.trainee
+    yield record, record.find(trainee) if trainee else record.add(person)
 
   def _record(self, recording: Recording, person: str, path: pathlib.Path | None) -> Kept:
     with self._opened(person) as (record, who):
@@ -288,8 +288,8 @@ def read(args: argparse.Namespace, task: str = "", pages: bool = False) -> Keepi
     if args.trainee is None:
       Record(folder(args), references(None))  # what is wrong with it is said now
     else:
-      with Record(folder(args)) as record:
-        name = record.find(args.trainee).name
+      record = Record(folder(args))
+      name = record.find(args.trainee).name
     keeping = Keeping(folder(args), name, args.references, args.any_task)
     keeping.check(task)
   return keeping

@@ -82,7 +82,7 @@ def _of_people(args: argparse.Namespace) -> Iterator[tuple[str, str | None, Any]
 
   if not args.trainee:
     return
-  with Record(keeping.folder(args)) as record:
-    for name in dict.fromkeys(args.trainee):
-      for episode in record.episodes(record.find(name)):
-        yield episode.task, episode.outcome, episode.metrics
+  record = Record(keeping.folder(args))
+  for name in dict.fromkeys(args.trainee):
+    for episode in record.episodes(record.find(name)):
+      yield episode.task, episode.outcome, episode.metrics

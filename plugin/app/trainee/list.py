@@ -18,7 +18,8 @@ def main(args: argparse.Namespace) -> int:
 
   from .record import Record
 
-  with keeping.one_line(), Record(keeping.folder(args)) as record:
+  with keeping.one_line():
+    record = Record(keeping.folder(args))
     for person in record.trainees():
       episodes = record.episodes(person)
       met = curriculum.done(history.passed(episodes))

@@ -117,8 +117,8 @@ def check_name(name: Any, option: str = "trainee") -> str:
   return text
 
 
-class Record(contextlib.AbstractContextManager):
-  """A record; a context, so that it is used as long as its block.
+class Record:
+  """A record.
 
   Attributes:
     folder: of the record
@@ -146,9 +146,6 @@ class Record(contextlib.AbstractContextManager):
       with self._alone():
         for part in self._people.glob("*/.*.part"):  # of a process that was killed
           part.unlink(missing_ok=True)
-
-  def __exit__(self, *_):
-    """Nothing is left to do."""
 
   @contextlib.contextmanager
   def _alone(self) -> Iterator[None]:

@@ -40,10 +40,10 @@ def main(args: argparse.Namespace) -> int:
   known = keeping.references(args.references)
   with keeping.one_line():
     metrics = curves.check_names(args.metric or curves.SHOWN)
-    with Record(keeping.folder(args)) as record:
-      person = record.find(args.name)
-      episodes = record.episodes(person)
-      keeping.tell(record)
+    record = Record(keeping.folder(args))
+    person = record.find(args.name)
+    episodes = record.episodes(person)
+    keeping.tell(record)
   if args.references:
     episodes = history.judged(episodes, known)
   then = _next(episodes)

@@ -5,9 +5,7 @@ import warp as wp
 from palpate.engine.layout import BLADE
 from palpate.forces import cutters
 from palpate.forces.host import for_worlds
-from palpate.tissue.types import allocate, floats, struct
-
-from .fracture import Cutters
+from palpate.tissue.types import allocate, floats, struct, tuple_of
 
 _WorldBlades = for_worlds(cutters.Blades)
 _STAGE, _WORK, _OPENED, _AT = (
@@ -22,13 +20,17 @@ def _turned(f: wp.array2d[wp.float64], c: int, x: wp.float64, y: wp.float64, z: 
 
 @struct
 class Told:
-  """Arrays of `Cutters`."""
+  """What cuts an organ in all worlds, in the order of its key `cutters`."""
 
-  inside: floats("nworld", "nblade")
-  force: floats("nworld", "nblade", 3)
-  energy: floats("nworld", "nblade")
-  length: floats("nworld", "nblade")
-  seat: floats("nworld", "nblade", 3)
+  inside: floats("nworld", "nblade")  # 1 where it has gone through the wall and is there
+  force: floats("nworld", "nblade", 3)  # on the tissue in the last step [N]
+  energy: floats("nworld", "nblade")  # that opening the tissue has taken [J]
+  length: floats("nworld", "nblade")  # of its paths so far, at rest [m]
+  seat: floats("nworld", "nblade", 3)  # where it is in the tissue at rest [m]
+
+
+class Cutters(tuple_of(Told)):
+  """The arrays of `Told`."""
 
 
 @wp.kernel(enable_backward=False)
@@ -73,7 +75,7 @@ class Shown:
     """Returns what they do."""
     dim, inputs = self._told.inside.shape, [self._force.fields, self._told]
     wp.launch(_show, dim=dim, inputs=inputs, device=self._force.host.device)
-    return Cutters(*(getattr(self._told, name) for name in Cutters._fields))
+    return Cutters.of(self._told)
 
 
 def feel(force: cutters.Cutters, adr: int, data: wp.array):

@@ -3,29 +3,13 @@
 from __future__ import annotations
 
 import abc
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
 from palpate.tissue.cutting.topology import Piece, Report
 
-
-class Cutters(NamedTuple):
-  """What cuts an organ in all worlds, in the order of its key `cutters`.
-
-  Attributes:
-    inside: 1 where it has gone through the wall and is there, (nworld, n)
-    force: on the tissue in the last step [N], (nworld, n, 3)
-    energy: that opening the tissue has taken [J], (nworld, n)
-    length: of its paths so far, at rest [m], (nworld, n)
-    seat: where it is in the tissue at rest [m], (nworld, n, 3)
-  """
-
-  inside: wp.array
-  force: wp.array
-  energy: wp.array
-  length: wp.array
-  seat: wp.array
+from .blades import Cutters
 
 
 class Parting(abc.ABC):

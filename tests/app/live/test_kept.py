@@ -18,8 +18,8 @@ ANSWER = 120.0  # that a busy machine may take [s]
 
 @pytest.fixture
 def folder(tmp_path):
-  with Record(tmp_path / "record", limits.lookup()) as record:
-    record.add("Ada")
+  record = Record(tmp_path / "record", limits.lookup())
+  record.add("Ada")
   return tmp_path / "record"
 
 
@@ -71,9 +71,9 @@ def test_an_exercise_on_the_page_is_kept_and_what_is_locked_refused(page, folder
   assert first["said"][-1].startswith("Attempt 1 at touch/easy") and not first["fault"]
   assert Recording.load(first["path"]).outcome == "stopped"
   assert folder in pathlib.Path(first["path"]).parents and not (tmp_path / "live").exists()
-  with Record(folder) as record:
-    assert [p.name for p in record.trainees()] == ["Ada"]
-    done = record.episodes(record.find("Ada"))
+  record = Record(folder)
+  assert [p.name for p in record.trainees()] == ["Ada"]
+  done = record.episodes(record.find("Ada"))
   assert [e.assessment for e in done] == [False, True] and done[0].hints > 0 == done[1].hints
   assert len({e.session for e in done}) == 1 and done[0].performer == "device:mouse"
 
@@ -101,6 +101,6 @@ def test_a_name_on_a_page_is_kept_apart_and_nothing_is_told(page, folder, tmp_pa
   assert not any("Attempt" in line for card in cards for line in card["said"])
   assert [folder in pathlib.Path(card["path"]).parents for card in cards] == [True, True, False]
   assert pathlib.Path(cards[2]["path"]).parent == tmp_path / "live"  # nobody's
-  with Record(folder) as record:
-    counts = {p.name: len(record.episodes(p)) for p in record.trainees()}
+  record = Record(folder)
+  counts = {p.name: len(record.episodes(p)) for p in record.trainees()}
   assert counts == {"Ada": 1, "Bo": 1}

@@ -191,8 +191,8 @@ def test_a_session_over_the_socket(serve, tmp_path):
 
 def test_a_killed_exercise_is_in_the_record_up_to_the_last_second(serve, tmp_path, capsys):
   folder = tmp_path / "record"
-  with Record(folder, limits.lookup()) as record:
-    ada = record.add("Ada")
+  record = Record(folder, limits.lookup())
+  ada = record.add("Ada")
   with socket(serve(kept=Keeping(folder, "Ada"))) as page:
     hear(page, "menu")
     tell(page, type="start", task="touch/easy", seed=3, assessment=True)
@@ -204,10 +204,10 @@ def test_a_killed_exercise_is_in_the_record_up_to_the_last_second(serve, tmp_pat
     (process,) = multiprocessing.active_children()
     process.kill()
     process.join()
-  with Record(folder) as record:
-    (done,) = record.episodes(ada)
-    made = Recording.load(record.path(done))
-    assert not record.said
+  record = Record(folder)
+  (done,) = record.episodes(ada)
+  made = Recording.load(record.path(done))
+  assert not record.said
   assert done.outcome == "interrupted" and done.seed == 3 and done.assessment
   assert now - 1.3 < made.time[-1] < now + 0.5 and not done.proficient
   assert "vertices" in made.constants and np.isfinite(made.columns["tip_pos"]).all()
