@@ -49,6 +49,8 @@ class WorldRods:
   bodyid: ints("nnode")  # its body
   massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
   own_dof: ints("nv")  # number of a dof in the rod: three times the node, and the axis; or -1
+  dof_tree: ints("nv")  # tree of bodies that a dof is of
+  geom_tree: ints("ngeom")  # and a geom, -1 if it does not move
   qpos0: floats("nq")
   # What worlds have of their own:
   now: doubles("nworld", "nnode", 3)  # place in the slides' axes [m]
@@ -76,6 +78,7 @@ class WorldRods:
   contact_dim: ints("naconmax")
   contact_flex: Array(wp.vec2i, ("naconmax",))
   contact_elem: Array(wp.vec2i, ("naconmax",))
+  contact_geom: Array(wp.vec2i, ("naconmax",))
   contact_friction: Array(vec5, ("naconmax",))
   # Its rows of constraints:
   type: ints("nworld", "njmax")
@@ -151,6 +154,8 @@ class Thread(base.Thread):
       bodyid=batch.numbers[organ.body],
       massadr=np.where(organ.free[:, None], (bare.M_rowadr + bare.M_rownnz - 1)[dofs], -1),
       own_dof=own_dof,
+      dof_tree=bare.dof_treeid,
+      geom_tree=bare.body_treeid[bare.geom_bodyid],
       qpos0=bare.qpos0,
       now=np.tile(organ.rest, (nworld, 1, 1)),
       speed=np.zeros((nworld, n, 3)),
@@ -162,7 +167,8 @@ class Thread(base.Thread):
       xfrc_applied=host.float_rows(d.xfrc_applied),
       **{name: getattr(bare, name) for name in ("M_rowadr", "M_rownnz", "M_colind")},
       **{
-        f"contact_{name}": getattr(d.contact, name) for name in ("dim", "flex", "elem", "friction")
+        f"contact_{name}": getattr(d.contact, name)
+        for name in ("dim", "flex", "elem", "geom", "friction")
       },
     )
     for name in WorldRods.vars:

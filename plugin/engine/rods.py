@@ -28,6 +28,9 @@ _MOST_ROWS = 48  # of MuJoCo's constraints, for one node
 # Centre lines come no nearer than this share of the diameter; neighbours along the thread, with no
 # more than this many radii between them, are not looked at.
 CORE, NEIGHBOURS = 0.5, 3.5
+# Edges within so many radii of a node that an equality holds are in what holds it and do not meet
+# it: half of what jaws of a needle driver have between them.
+GRIP = 24.0
 _MOST_PAIRS = 32  # of edges near each other, for one node
 _SOFT = 0.05  # modulus across a thread over that along it, an estimate
 _SLOW = 1e-6  # velocity below which friction within a thread is viscous [m/s]
@@ -39,7 +42,7 @@ _WRITTEN = (
   *("start", "vel", "external", "aim", "place", "turn", "force", "move", "trial", "gradient"),
   *("matrix", "inverse", "rank", "near", "ranked", "first", "start_of_row", "below", "status"),
   *("count", "smooth", "reach", "listed", "pair", "pressure", "touch"),
-  *("row_kind", "row_node", "row_value"),
+  *("row_kind", "row_node", "row_value", "grip"),
 )
 _HUGE = 1e6  # more than any twist [rad]
 
@@ -99,6 +102,7 @@ class Rod:
   row_kind: ints("nrow")  # see `RowKind`
   row_node: ints("nrow")  # the first of the two nodes
   row_value: doubles("nrow", 9)  # J of their dofs; J a of other bodies less aref; D; friction
+  grip: ints("nnode")  # tree of bodies that holds a node or one near it, or -1
   tie_count: ints(1)  # what holds it, see `coupling.Ties`
   tie_edge: ints("ntie")  # the edge that is held
   tie_value: doubles("ntie", len(layout.TIE))  # see TIE
@@ -118,6 +122,8 @@ class Bound:
   massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
   solution: doubles("nv")  # scratch
   own_dof: ints("nv")  # number of a dof in the rod: three times the node, and the axis; or -1
+  dof_tree: ints("nv")  # tree of bodies that a dof is of
+  geom_tree: ints("ngeom")  # and a geom, -1 if it does not move
   frame: doubles(3, 3)  # rotation from the slides' axes to the world
   mj: Mujoco
   # MuJoCo's memory under its own names; the mjData itself:
@@ -134,7 +140,7 @@ class Bound:
   M_colind: ints("nC")
 
 
-CONSTANTS = contacts.CONSTANTS | {"CORE": CORE, "NEIGHBOURS": NEIGHBOURS}
+CONSTANTS = contacts.CONSTANTS | {"CORE": CORE, "NEIGHBOURS": NEIGHBOURS, "GRIP": GRIP}
 begin, end = (
   kernel(name, "coupling/mujoco_rod.h", Bound, CONSTANTS) for name in ("begin_rod", "end_rod")
 )
@@ -323,6 +329,10 @@ class Workspace:
       massadr=np.where(organ.free[:, None], coupling.mass_addresses(m, dofs), -1),
       solution=np.zeros(m.nv),
       own_dof=own_dof,
+      dof_tree=mjstruct.view(m.dof_treeid, m.nv, np.int32),
+      geom_tree=mjstruct.view(m.body_treeid, m.nbody, np.int32)[
+        mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
+      ],
       frame=organ.frame,
       mj=coupling.mujoco_arrays(model, self.data),
       nv=m.nv,

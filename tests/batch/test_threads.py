@@ -117,6 +117,18 @@ def test_a_needle_swings_on_its_thread(device):
   np.testing.assert_allclose(worlds.qpos.numpy()[0], data.qpos, atol=1e-4)
 
 
+@SLOW
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_held_thread_does_not_meet_the_jaws_that_it_is_in(device):
+  model, data, thread, worlds = scene(one.hand(), device)
+  run(model, data, worlds, 10, one.shake)
+  assert off(thread, worlds) < 1e-8
+  run(model, data, worlds, 50, one.shake)  # the tails meet the edges of the jaws
+  held = worlds.thread("t").xpos.numpy()[:, 20] - thread.positions[20]
+  assert np.abs(held).max() < 1e-5
+  assert worlds.thread("t").tension.numpy().max() < 0.1
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_world_goes_on_where_a_state_says(device):
   """There and back, and after a reset."""

@@ -260,6 +260,41 @@ def test_jaws_hold_a_thread_by_friction(condim, share, holds):
     assert thread.error is None
 
 
+def hand(n=41):
+  """Returns jaws that close on a thread in the middle, where an equality holds it."""
+  jaws = "".join(
+    f"""<body pos="0 0 {-way * 0.0014}"><joint name="jaw{k}" type="slide" axis="0 0 {way}"
+      damping="2"/><geom type="box" size="0.002 0.002 0.001" mass="0.02" friction="0.2"
+      solref="0.002 1"/></body>"""
+    for k, way in enumerate((-1, 1))
+  )
+  world = f"""<body name="hand" pos="0.01 0 0"><joint name="hand" type="slide" axis="0 1 0"
+    damping="5"/><geom size="0.001" mass="0.2" contype="0" conaffinity="0"/>{jaws}</body>"""
+  motors = "".join(f'<motor joint="{name}"/>' for name in ("hand", "jaw0", "jaw1"))
+  ties = f"""<equality><connect body1="hand" body2="t_{n // 2}" anchor="0 0 0"
+    solref="0.002 1"/></equality>"""
+  option = f'{FREE} cone="elliptic" impratio="10"'
+  after = f"<actuator>{motors}</actuator>{ties}"
+  return document(line(n, 0.02), option=option, world=world, after=after, bend=0.02)
+
+
+def shake(k):
+  """Returns the forces on a hand and its jaws in a step: 15 g there and back, and a grip of 5 N."""
+  return 30.0 * np.sign(np.sin(2 * np.pi * k / 50)), 5.0, 5.0
+
+
+def test_a_held_thread_does_not_meet_the_jaws_that_it_is_in():
+  """Its whipping tails pull at it by 40 mN; against the jaws it would bear 50 N and be lost."""
+  model, data, thread = loaded(hand())
+  for k in range(200):
+    data.ctrl[:] = shake(k)
+    run(model, data, 1)
+    at = thread.positions[20] - (0.01, data.joint("hand").qpos[0], 0)
+    assert np.abs(thread.tension).max() < 0.1
+    assert np.linalg.norm(at) < 2e-4
+  assert thread.error is None
+
+
 def test_forward_twice_changes_nothing():
   motion = []
   for extra in (0, 2):

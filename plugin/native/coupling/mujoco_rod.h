@@ -75,11 +75,13 @@ struct MujocoRod {
   PALPATE void note_rows() const {
     const int nefc = datum<int>(f, DATA_NEFC), ncon = nefc > 0 ? datum<int>(f, DATA_NCON) : 0;
     char* const contacts = datum<char*>(f, DATA_CONTACT);
+    note_grips(*this, nefc, datum<int*>(f, DATA_EFC_TYPE));
     for (int c = 0; c < ncon; ++c) {
       const char* contact = contacts + (size_t)CONTACT_LENGTH * c;
       const Rows rows = is_own(contact) ? rows_of(f, contact) : Rows{0, 0, false};
       if (!rows.count) continue;
-      if (is_broken(rod, f.flex, (const int*)(contact + CONTACT_FLEX), (const int*)(contact + CONTACT_ELEM))) {  // MuJoCo still has it
+      if (is_open(*this, (const int*)(contact + CONTACT_FLEX), (const int*)(contact + CONTACT_ELEM),
+                  (const int*)(contact + CONTACT_GEOM))) {  // MuJoCo still has it
         empty(rows);
         continue;
       }

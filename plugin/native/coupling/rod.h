@@ -90,6 +90,26 @@ PALPATE bool note_row(const Host& host, int r, int kind, double friction, int co
   return true;
 }
 
+// Notes by which tree of bodies an equality holds each node, or one near it along the thread; NOWHERE if by none.
+template <class Host>
+PALPATE void note_grips(const Host& host, int nefc, const int* type) {
+  const auto& rod = host.rod;
+  for (int i = 0; i < rod.nnode; ++i) rod.grip.data[i] = NOWHERE;
+  for (int r = 0; r < nefc; ++r) {
+    if (type[r] != IS_EQUALITY) continue;
+    const auto row = host.row(r);
+    const int node = first_node(host, row);
+    if (node < 0) continue;
+    int tree = NOWHERE;
+    for (int k = 0; k < row.count; ++k) {
+      const int dof = row.dof ? row.dof[k] : k;
+      if (row.value[k] != 0.0 && host.own_dof(dof) < 0) tree = host.f.dof_tree.data[dof];
+    }
+    for (int i = 0; i < rod.nnode && tree >= 0; ++i)
+      if (fabs(rod.along.data[i] - rod.along.data[node]) <= GRIP * rod.radius) rod.grip.data[i] = tree;
+  }
+}
+
 // Notes the rows of a contact, of a cone where `mu` says so: whole or not at all.
 template <class Host, class Number>
 PALPATE void note_contact(const Host& host, int first, int count, bool cone, double mu, const Number* friction) {
@@ -198,11 +218,18 @@ PALPATE void begin(const Host& host, double h) {
   });
 }
 
-// Whether a contact, of which `flex` and `elem` are the two sides, is one of an edge of the rod that has broken.
-template <class Rod>
-PALPATE bool is_broken(const Rod& rod, int own, const int* flex, const int* elem) {
-  for (int side = 0; side < 2; ++side)
-    if (flex[side] == own && elem[side] >= 0 && !is_whole(rod, elem[side])) return true;
+// Whether a contact, whose two sides are told, is not to be: of an edge of the rod that has broken, or of one that
+// is in what holds it.
+template <class Host>
+PALPATE bool is_open(const Host& host, const int* flex, const int* elem, const int* geom) {
+  const auto& rod = host.rod;
+  for (int side = 0; side < 2; ++side) {
+    const int edge = elem[side], other = geom[1 - side];
+    if (flex[side] != host.f.flex || edge < 0) continue;
+    if (!is_whole(rod, edge)) return true;
+    const int tree = other < 0 ? NOWHERE : host.f.geom_tree.data[other];
+    if (tree >= 0 && (rod.grip.data[edge] == tree || rod.grip.data[edge + 1] == tree)) return true;
+  }
   return false;
 }
 

@@ -85,6 +85,7 @@ struct WorldRod {
   PALPATE void note_rows() const {
     const int most = (int)f.aref.shape[1], nefc = f.nefc.data[0] < most ? f.nefc.data[0] : most;
     const int* type = f.type.data;
+    note_grips(*this, nefc, type);
     for (int r = 0, count = 1; r < nefc; r += count) {
       count = 1;
       if (type[r] < IS_CONTACT) continue;
@@ -93,7 +94,8 @@ struct WorldRod {
       count = paired ? 2 * (dim - 1) : dim;
       const int* flex = (const int*)f.contact_flex.data + 2 * c;
       if ((flex[0] != f.flex && flex[1] != f.flex) || r + count > nefc) continue;
-      if (is_broken(rod, f.flex, flex, (const int*)f.contact_elem.data + 2 * c)) {  // mujoco_warp still has it
+      if (is_open(*this, flex, (const int*)f.contact_elem.data + 2 * c, (const int*)f.contact_geom.data + 2 * c)) {
+        // mujoco_warp still has it
         for (int k = r; k < r + count; ++k) {
           const auto own = row(k);
           for (int a = 0; a < own.count; ++a) own.value[a] = 0.0f;
