@@ -53,7 +53,8 @@ def add_thread(
     contact: attributes of <contact> that are not as usual
     bead: radius of what is at its last node, such as a clip or a knot: it touches nothing, but does
       not go through a needle's hole that is narrower; 0 for none [m]
-    **config: keys of a rod that are not the material's: young, poisson, bend, twist, strength
+    **config: keys of a rod that are not the material's: young, poisson, bend, twist, strength,
+      drag
 
   Returns:
     The flex, for instance to give it a material.

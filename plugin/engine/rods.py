@@ -70,6 +70,7 @@ class Rod:
   bend: doubles("nnode")  # E I over the length of a node [N m]
   torsion: doubles("nnode")  # G J over the length of a node [N m]
   mass: doubles("nnode")  # of a node [kg]
+  drag: doubles("nnode")  # force against a node by its velocity [N s/m]
   spin: doubles("nnode")  # inertia of an edge about itself [kg m^2]
   held: ints("nunknown")  # whether an unknown does not change
   # A step:

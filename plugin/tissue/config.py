@@ -116,6 +116,13 @@ class Config:
     'with `elements="rod"` alone',
     "N",
   )
+  drag: float = _row(
+    0.0,
+    reading.NOT_NEGATIVE,
+    "force of what a rod moves in, by length and velocity ([threads](physics.md#threads)); with "
+    '`elements="rod"` alone',
+    "N s/m²",
+  )
   foundation: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
@@ -291,7 +298,7 @@ KEYS = tuple(ROWS)
 RUNNING = tuple(key for key, row in ROWS.items() if row.change)
 MATERIAL = tuple(key for key, row in ROWS.items() if row.change == TISSUE)
 # All that a rod may have:
-ROD = ("elements", "young", "poisson", "bend", "twist", "strength", "iterations")
+ROD = ("elements", "young", "poisson", "bend", "twist", "strength", "drag", "iterations")
 RECORDED = tuple(key for key, row in ROWS.items() if row.change == GRAPH)
 
 
@@ -415,7 +422,7 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
         raise ValueError(
           f"organ {organ!r}: {key} is set and elements is 'rod', expected {', '.join(ROD)}"
         )
-  elif only_rods := {"twist", "strength"} & set(given):
+  elif only_rods := {"twist", "strength", "drag"} & set(given):
     key = min(only_rods)
     raise ValueError(f"organ {organ!r}: {key} is set, allowed only with elements='rod'")
   spring = config.elements == "spring"

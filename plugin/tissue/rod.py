@@ -115,6 +115,7 @@ def constants(
     "length": np.append(length, 0.0),
     "along": np.append(0.0, np.cumsum(length)),
     "stretch": np.append(young * area / length, 0.0),
+    "drag": config.drag * 0.5 * (np.append(length, 0.0) + np.append(0.0, length)),
     "bend": bend,
     "torsion": torsion,
     "spin": np.append(0.25 * (mass[1:] + mass[:-1]), 1.0) * radius**2,

@@ -47,7 +47,7 @@ SLOW = pytest.mark.slow
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_hanging_thread_swings_as_under_the_plugin(device):
-  model, data, thread, worlds = scene(one.document(one.line(21, 0.04), pin=(0,)), device)
+  model, data, thread, worlds = scene(one.document(one.line(21, 0.04), pin=(0,), drag=1e-3), device)
   run(model, data, worlds, 60)
   assert off(thread, worlds) < 1e-7
   assert np.abs(data.qvel).max() > 0.5

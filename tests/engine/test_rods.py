@@ -128,6 +128,10 @@ def test_a_twisted_rod_buckles_at_greenhills_twist(share, buckles):
 # Motion.
 
 
+def energy(data, thread):
+  return thread.energy + 0.5 * MASS / len(thread.positions) * (data.qvel**2).sum()
+
+
 def test_free_flight_keeps_momentum():
   model, data, _ = load(line(31, 0.06), option=FREE)
   rng = np.random.RandomState(0)
@@ -144,9 +148,26 @@ def test_energy_only_falls():
   energies = []
   for _ in range(300):
     run(model, data, 1)
-    energies.append(0.5 * MASS / 41 * (data.qvel**2).sum() + thread.energy)
+    energies.append(energy(data, thread))
   assert (np.diff(energies) <= 1e-9 * energies[0]).all()
   assert thread.error is None
+
+
+def test_a_plucked_thread_rings_down_by_its_drag():
+  """Its energy falls as exp(-c t / m) against that without, whatever the step itself damps."""
+  n, drag, h, steps = 21, 8e-3, 1e-4, 800
+  left = []
+  for c in (0.0, drag):
+    model, data, thread = load(line(n, 0.04), pin=(0, 1, n - 2, n - 1), h=h, option=FREE, drag=c)
+    force(model, data, n // 2, (0, 0, 1e-5))
+    run(model, data, 300)
+    force(model, data, n // 2, (0, 0, 0))
+    start = energy(data, thread)
+    run(model, data, steps)
+    left.append(energy(data, thread) / start)
+  rate = drag * 0.04 / (n - 1) / (MASS / n)  # of a node [1/s]
+  assert left[1] / left[0] == pytest.approx(np.exp(-rate * steps * h), rel=0.05)
+  assert left[1] < 0.2 * left[0]
 
 
 @pytest.mark.parametrize("h", [1e-3, 2e-3])

@@ -1,10 +1,11 @@
 // An implicit Euler step of a rod: the least of
 //
-//   sum m / (2 h^2) |x - x0 - h v - h^2 f / m|^2 + E(x) + h^2 sum s(J a - aref),  a = (x - x0 - h v) / h^2
+//   sum m / (2 h^2) |x - x0 - h v - h^2 f / m|^2 + c / (2 h) |x - x0|^2 + E(x) + h^2 sum s(J a - aref),
+//   a = (x - x0 - h v) / h^2,
 //
-// by Newton's method with a line search. The last sum is MuJoCo's cost of the constraints that the rod
-// takes part in (Todorov 2014, doi:10.1109/ICRA.2014.6907751), with the rod's own stiffness in place of
-// MuJoCo's inertia. A row's dofs are those of two neighbouring nodes, so the matrix stays banded.
+// c the drag of a node, by Newton's method with a line search. The last sum is MuJoCo's cost of the constraints
+// that the rod takes part in (Todorov 2014, doi:10.1109/ICRA.2014.6907751), with the rod's own stiffness in place
+// of MuJoCo's inertia. A row's dofs are those of two neighbouring nodes, so the matrix stays banded.
 #pragma once
 #include "tissue/rod_contact.h"
 #include "tissue/rod_ties.h"
@@ -141,7 +142,8 @@ PALPATE double step_cost(const Fields& f, const double* x, const double* turn, d
   if (least > most) return least;
   double sum = 0.0;
   each_lane(0, f.nnode, [&](int i) {
-    const D3 off = load(x + 3 * i) - load(f.aim.data + 3 * i);
+    const D3 off = load(x + 3 * i) - load(f.aim.data + 3 * i), moved = load(x + 3 * i) - load(f.start.data + 3 * i);
+    sum += 0.5 * f.drag.data[i] / h * dot(moved, moved);
     sum += 0.5 * f.mass.data[i] / (h * h) * dot(off, off) + 0.5 * f.spin.data[i] / (h * h) * turn[i] * turn[i];
   });
   const double own = sum + rod_energy(f, x, turn) + contacts_energy(f, x, h, nullptr, nullptr, false) +
@@ -156,10 +158,11 @@ PALPATE void assemble(const Fields& f, const double* x, const double* turn, doub
   const RodMatrix H = matrix_of(f);
   each_lane(0, f.count.data[2], [&](int a) { H.value[a] = 0.0; });
   each_lane(0, f.nnode, [&](int i) {
-    const double m = f.mass.data[i] / (h * h), spin = f.spin.data[i] / (h * h);
-    store(g + 4 * i, m * (load(x + 3 * i) - load(f.aim.data + 3 * i)));
+    const double m = f.mass.data[i] / (h * h), spin = f.spin.data[i] / (h * h), c = f.drag.data[i] / h;
+    const D3 at = load(x + 3 * i);
+    store(g + 4 * i, m * (at - load(f.aim.data + 3 * i)) + c * (at - load(f.start.data + 3 * i)));
     g[4 * i + 3] = spin * turn[i];
-    for (int c = 0; c < H.per; ++c) H.at(H.of(i, c), H.of(i, c)) = c < 3 ? m : spin;
+    for (int k = 0; k < H.per; ++k) H.at(H.of(i, k), H.of(i, k)) = k < 3 ? m + c : spin;
   });
   add_rod(f, x, turn, g, H, exact);
   contacts_energy(f, x, h, g, &H, exact);
