@@ -39,7 +39,6 @@ class WorldRods:
   flex: int  # its flex
   sparse: int  # whether rows have the columns that they need alone
   falls: int  # whether there is gravity
-  joined: int  # whether equalities may act on it
   timestep: wp.float64
   impratio: wp.float64
   rest: doubles("nnode", 3)  # rest position in the slides' axes [m]
@@ -55,9 +54,6 @@ class WorldRods:
   # What worlds have of their own:
   now: doubles("nworld", "nnode", 3)  # place in the slides' axes [m]
   speed: doubles("nworld", "nnode", 3)  # velocity [m/s]
-  factor: doubles("nworld", "nC")  # of M, as MuJoCo's qLD
-  inverse_diagonal: doubles("nworld", "nv")  # of that, as qLDiagInv
-  solution: doubles("nworld", "nv")  # scratch
   bad: ints("nworld")  # whether a number is not finite
   # mujoco_warp's model:
   gravity: Array(wp.vec3, ("nworld",))
@@ -144,7 +140,6 @@ class Thread(base.Thread):
       flex=mujoco.mj_name2id(bare, mujoco.mjtObj.mjOBJ_FLEX, organ.name),
       sparse=int(m.is_sparse),
       falls=int(not bare.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY),
-      joined=int(bare.neq > 0),
       timestep=float(bare.opt.timestep),
       impratio=float(bare.opt.impratio),
       rest=organ.rest,
@@ -159,9 +154,6 @@ class Thread(base.Thread):
       qpos0=bare.qpos0,
       now=np.tile(organ.rest, (nworld, 1, 1)),
       speed=np.zeros((nworld, n, 3)),
-      factor=np.zeros((nworld, bare.nC)),
-      inverse_diagonal=np.zeros((nworld, bare.nv)),
-      solution=np.zeros((nworld, bare.nv)),
       bad=batch.bad,
       gravity=m.opt.gravity,
       xfrc_applied=host.float_rows(d.xfrc_applied),

@@ -121,7 +121,6 @@ class Bound:
   qposadr: ints("nnode")  # its first number in qpos
   bodyid: ints("nnode")  # its body
   massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
-  solution: doubles("nv")  # scratch
   own_dof: ints("nv")  # number of a dof in the rod: three times the node, and the axis; or -1
   dof_tree: ints("nv")  # tree of bodies that a dof is of
   geom_tree: ints("ngeom")  # and a geom, -1 if it does not move
@@ -328,7 +327,6 @@ class Workspace:
       qposadr=organ.qposadr,
       bodyid=organ.body,
       massadr=np.where(organ.free[:, None], coupling.mass_addresses(m, dofs), -1),
-      solution=np.zeros(m.nv),
       own_dof=own_dof,
       dof_tree=mjstruct.view(m.dof_treeid, m.nv, np.int32),
       geom_tree=mjstruct.view(m.body_treeid, m.nbody, np.int32)[

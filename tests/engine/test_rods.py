@@ -10,7 +10,8 @@ from scipy.optimize import brentq
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 RADIUS, YOUNG, POISSON, MASS = 1e-4, 5e9, 0.3, 8e-6
-STRETCH = YOUNG * np.pi * RADIUS**2  # E A [N]
+AREA = np.pi * RADIUS**2  # [m^2]
+STRETCH = YOUNG * AREA  # E A [N]
 BENDING = YOUNG * np.pi * RADIUS**4 / 4  # E I [N m^2]
 
 
@@ -248,6 +249,35 @@ def test_a_needle_swings_on_its_thread(mass):
   assert low == pytest.approx(-0.08, rel=0.02)
   assert 2 * weight < most < 20 * weight  # a point pulls with 3 weights; this is jerked as it turns
   assert thread.error is None
+
+
+def test_jaws_that_hold_a_light_needle_take_its_thread_along():
+  """By 4 mm, which stretch it to 0.6 N; its end stays at the needle as if the jaws held it."""
+  n, far = 41, 0.004
+  firm = 'condim="4" friction="1 0.005 1e-4" solref="0.002 1" solimp="0.999 0.9999 0.001"'
+  jaws = "".join(
+    f"""<body pos="0 0 {-way * 0.0014}"><joint name="j{k}" type="slide" axis="0 0 {way}"
+    damping="20"/><geom type="box" size="0.004 0.002 0.001" mass="0.1" {firm}/></body>"""
+    for k, way in enumerate((-1, 1))
+  )
+  world = f"""<body name="needle" pos=".08 0 0"><freejoint/><geom type="capsule" size=".0004"
+    fromto="0 0 0 .012 0 0" mass="1e-4" {firm}/></body>
+    <body pos=".089 0 0"><joint name="along" type="slide" axis="1 0 0" damping="100"/>
+    <geom type="sphere" size=".001" mass="1" contype="0" conaffinity="0"/>{jaws}</body>"""
+  after = f"""<equality><connect body1="needle" body2="t_{n - 1}" anchor="0 0 0" solref=".005 1"
+    solimp="0.999 0.9999 0.001"/></equality><actuator><motor joint="j0"/><motor joint="j1"/>
+    <position joint="along" kp="20000"/></actuator>"""
+  model, data, thread = load(
+    line(n, 0.08), pin=(0,), world=world, after=after, bend=0.02, young=0.6 * 0.08 / far / AREA,
+    option=f'{FREE} cone="elliptic" impratio="100"', contact='contype="0" conaffinity="0"',
+  )  # fmt: skip
+  data.ctrl[:2] = 5.0
+  run(model, data, 50)
+  for k in range(400):
+    data.ctrl[2] = far * min(1.0, k / 300)
+    run(model, data, 1)
+    assert np.linalg.norm(thread.positions[-1] - data.body("needle").xpos) < 5e-4
+  np.testing.assert_allclose(thread.tension, 0.6, rtol=0.05)
 
 
 @pytest.mark.parametrize("condim", [3, 6])

@@ -13,9 +13,7 @@ struct MujocoRod {
   const decltype(Fields::rod)& rod;
 
   PALPATE int own_dof(int dof) const { return f.own_dof.data[dof]; }
-  PALPATE double* solution() const { return f.solution.data; }
-  PALPATE const double* qLD() const { return f.mj.qLD.data; }
-  PALPATE const double* qLDiagInv() const { return f.mj.qLDiagInv.data; }
+  PALPATE const double* M() const { return f.mj.M.data; }
 
   PALPATE Row row(int r) const { return row_of(f, r); }
   PALPATE double reference(int r) const {

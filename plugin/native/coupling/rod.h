@@ -1,7 +1,8 @@
 // The coupling of a rod to MuJoCo.
 //
 // The rod's step is taken with the constraints that MuJoCo has found for this step, on bodies that move on as
-// they did; those that an equality joins to it yield to its force. So it reaches MuJoCo as a force on its nodes,
+// they did; those that an equality joins to it yield to its force, as far as other constraints do not hold them. So it
+// reaches MuJoCo as a force on its nodes,
 //
 //   qfrc_passive = Mhat (v1 - v) / h - f_ext - f_c,
 //
@@ -39,27 +40,85 @@ PALPATE int first_node(const Host& host, Row row) {
   return last - first > 1 ? APART : first;
 }
 
-// How other bodies give way to a row's force, J M^-1 J^T of their dofs [1/kg], by MuJoCo's factors of M. A row
-// that has a dof has those above it, on which alone its part of the solution depends.
-template <class Host, class Row>
-PALPATE double yields(const Host& host, Row row) {
-  const auto& f = host.f;
-  double* x = host.solution();
-  const auto own = [&](int k) { return host.own_dof(row.dof ? row.dof[k] : k) >= 0; };
-  for (int k = 0; k < row.count; ++k) x[row.dof ? row.dof[k] : k] = own(k) ? 0.0 : row.value[k];
-  for (int k = row.count - 1; k >= 0; --k) {
-    const int i = row.dof ? row.dof[k] : k, start = f.M_rowadr.data[i], last = f.M_rownnz.data[i] - 1;
-    if (x[i] == 0.0) continue;
-    for (int c = 0; c < last; ++c) x[f.M_colind.data[start + c]] -= host.qLD()[start + c] * x[i];
+// Most dofs of what an equality joins to a rod; others stand still in its step.
+constexpr int MOST_DOFS = 16;
+
+// What an equality joins to the rod, by its dofs: how it gives way to a force. It does so against its inertia and against
+// the constraints that held it in the last step: a needle weighs little beside the jaws that hold it. Their other side
+// gives way by each of its dofs alone.
+template <class Host>
+struct Joined {
+  const Host& host;
+  int count = 0, dof[MOST_DOFS];
+  double L[MOST_DOFS][MOST_DOFS];  // lower triangle: inertia, then its factor by Cholesky
+
+  PALPATE int find(int d) const {
+    for (int k = 0; k < count; ++k)
+      if (dof[k] == d) return k;
+    return -1;
   }
-  // M = L^T D L: with y = L^-T J, J M^-1 J^T is y^T D^-1 y.
-  double sum = 0.0;
-  for (int k = 0; k < row.count; ++k) {
-    const int i = row.dof ? row.dof[k] : k;
-    sum += x[i] * x[i] * host.qLDiagInv()[i];
+  PALPATE double inertia(int d) const { return host.M()[host.f.M_rowadr.data[d] + host.f.M_rownnz.data[d] - 1]; }
+
+  // Takes the dofs of a row that are not the rod's.
+  template <class Row>
+  PALPATE void take(Row row) {
+    for (int k = 0; k < row.count; ++k) {
+      const int d = row.dof ? row.dof[k] : k;
+      if (row.value[k] == 0.0 || host.own_dof(d) >= 0 || find(d) >= 0 || count == MOST_DOFS) continue;
+      dof[count] = d;
+      for (int b = 0; b <= count; ++b) L[count][b] = 0.0;
+      ++count;
+    }
   }
-  return sum;
-}
+  PALPATE void weigh() {
+    for (int a = 0; a < count; ++a)
+      for (int k = 0; k < host.f.M_rownnz.data[dof[a]]; ++k) {
+        const int at = host.f.M_rowadr.data[dof[a]] + k, b = find(host.f.M_colind.data[at]);
+        if (b >= 0) L[a > b ? a : b][a > b ? b : a] = host.M()[at];
+      }
+  }
+  // Adds what row `r` holds it by, where that bore in the last step or does always; returns whether it did.
+  PALPATE bool hold(int r, bool always) {
+    const auto row = host.row(r);
+    double J[MOST_DOFS] = {}, gives = 1.0 / host.stiffness(r), residual = -host.reference(r);
+    bool here = false;
+    for (int k = 0; k < row.count; ++k) {
+      const int d = row.dof ? row.dof[k] : k, own = find(d);
+      if (row.value[k] == 0.0) continue;
+      if (host.own_dof(d) >= 0) return false;
+      residual += row.value[k] * host.last_acceleration(d);
+      if (own >= 0) J[own] = row.value[k], here = true;
+      else gives += row.value[k] * row.value[k] / inertia(d);
+    }
+    if (!here || !(always || residual < 0.0)) return false;
+    for (int a = 0; a < count; ++a)
+      for (int b = 0; b <= a; ++b) L[a][b] += J[a] * J[b] / gives;
+    return true;
+  }
+  PALPATE void factorize() {
+    for (int a = 0; a < count; ++a)
+      for (int b = 0; b <= a; ++b) {
+        double sum = L[a][b];
+        for (int k = 0; k < b; ++k) sum -= L[a][k] * L[b][k];
+        L[a][b] = a == b ? sqrt(sum) : sum / L[b][b];
+      }
+  }
+  // J M^-1 J^T of a row [1/kg].
+  template <class Row>
+  PALPATE double yields(Row row) const {
+    double x[MOST_DOFS] = {}, sum = 0.0;
+    for (int k = 0; k < row.count; ++k) {
+      const int a = find(row.dof ? row.dof[k] : k);
+      if (a >= 0) x[a] = row.value[k];
+    }
+    for (int a = 0; a < count; ++a) {
+      for (int b = 0; b < a; ++b) x[a] -= L[a][b] * x[b];
+      x[a] /= L[a][a];
+      sum += x[a] * x[a];
+    }
+    return sum;
+  }
+};
 
 // Notes MuJoCo's row `r` where it acts on the rod; returns whether it does. A row of a cone that turns others
 // about the contact does not reach nodes, and is one of the node `cone`.
@@ -128,12 +187,24 @@ PALPATE void note_contact(const Host& host, int first, int count, bool cone, dou
 // acceleration the row's last force is taken off, and it gives way to the new one. It does so by as much as in all
 // rows together, no less than in any direction: too little would overshoot.
 template <class Host>
-PALPATE void note_equality(const Host& host, int r, int count) {
+PALPATE void note_equality(const Host& host, int r, int count, int nefc, const int* type, const int* id) {
   const auto& rod = host.rod;
   const int from = rod.count.data[0];
+  for (int k = 0; k < count; ++k) note_row(host, r + k, BOTH, 0.0);
+  if (rod.count.data[0] == from) return;
+  Joined<Host> other{host};
+  for (int k = 0; k < count; ++k) other.take(host.row(r + k));
+  other.weigh();
+  bool held = false;
+  for (int k = 0; k < nefc; ++k) {
+    if (type[k] != IS_EQUALITY && type[k] < IS_LIMIT) continue;  // friction of joints
+    const bool tangent = k > 0 && type[k] == CONTACT_ELLIPTIC && type[k - 1] == type[k] && id[k - 1] == id[k];
+    if (tangent && held) other.hold(k, true);
+    if (!tangent) held = other.hold(k, type[k] == IS_EQUALITY);
+  }
+  other.factorize();
   double way = 0.0;
-  for (int k = 0; k < count; ++k)
-    if (note_row(host, r + k, BOTH, 0.0)) way += yields(host, host.row(r + k));
+  for (int k = 0; k < count; ++k) way += other.yields(host.row(r + k));
   for (int at = from; at < rod.count.data[0]; ++at) {
     double* J = rod.row_value.data + (DOFS + 3) * at;
     const double* last = rod.own.force.data + 3 * rod.row_node.data[at];
@@ -154,7 +225,7 @@ PALPATE void note_joints(const Host& host, int nefc, const int* type, const int*
   for (int r = 0, count = 1; r < nefc; r += count) {
     for (count = 1; type[r] == IS_EQUALITY && r + count < nefc && type[r + count] == IS_EQUALITY && id[r + count] == id[r];)
       ++count;
-    if (type[r] == IS_EQUALITY) note_equality(host, r, count);
+    if (type[r] == IS_EQUALITY) note_equality(host, r, count, nefc, type, id);
     if (type[r] == IS_LIMIT) note_row(host, r, ONE, 0.0);
   }
 }

@@ -15,9 +15,7 @@ struct WorldRod {
   decltype(*Fields().rods.data) rod;
 
   PALPATE int own_dof(int dof) const { return f.own_dof.data[dof]; }
-  PALPATE double* solution() const { return f.solution.data; }
-  PALPATE const double* qLD() const { return f.factor.data; }
-  PALPATE const double* qLDiagInv() const { return f.inverse_diagonal.data; }
+  PALPATE const float* M() const { return f.M.data; }
 
   PALPATE RowOf<float> row(int r) const {
     if (!f.sparse) return {f.J.data + (size_t)r * f.J.shape[2], nullptr, f.nv};
@@ -65,22 +63,6 @@ struct WorldRod {
             (float)exact.z == t.z ? exact.z : t.z};
   }
 
-  // The factors L^T D L of the inertia of other dofs (Featherstone 2008, table 6.3).
-  PALPATE void factor_others() const {
-    double* L = f.factor.data;
-    for (int k = 0; k < (int)f.M.shape[1]; ++k) L[k] = f.M.data[k];
-    for (int k = f.nv - 1; k >= 0; --k) {
-      const int start = f.M_rowadr.data[k], last = f.M_rownnz.data[k] - 1;
-      const double inverse = f.inverse_diagonal.data[k] = 1.0 / L[start + last];
-      for (int c = last - 1; c >= 0; --c) {
-        const double share = L[start + c] * inverse;
-        double* above = L + f.M_rowadr.data[f.M_colind.data[start + c]];
-        for (int b = 0; b <= c; ++b) above[b] -= share * L[start + b];
-        L[start + c] = share;
-      }
-    }
-  }
-
   // Notes the rows of constraints that act on the rod, those of contacts first.
   PALPATE void note_rows() const {
     const int most = (int)f.aref.shape[1], nefc = f.nefc.data[0] < most ? f.nefc.data[0] : most;
@@ -106,7 +88,6 @@ struct WorldRod {
       const float* friction = (const float*)f.contact_friction.data + 5 * c;
       note_contact(*this, r, count, !paired && count > 1, friction[0] / sqrt(f.impratio), friction);
     }
-    if (f.joined) factor_others();
     note_joints(*this, nefc, type, f.id.data);
   }
 
@@ -135,7 +116,7 @@ struct WorldRod {
 
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
-  move_each(world, f.solution, f.factor, f.inverse_diagonal, f.now, f.speed, f.gravity, f.qpos, f.qvel, f.qfrc_applied,
+  move_each(world, f.now, f.speed, f.gravity, f.qpos, f.qvel, f.qfrc_applied,
             f.xfrc_applied, f.qfrc_passive, f.qfrc_smooth, f.qacc, f.qacc_warmstart, f.M, f.nefc, f.type, f.id, f.J,
             f.J_rownnz, f.J_rowadr, f.J_colind, f.D, f.aref);
   return f;
