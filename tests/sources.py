@@ -51,21 +51,6 @@ def below(folder: str) -> list[pathlib.Path]:
 
 
 @functools.cache
-def strings(path: pathlib.Path) -> list[str]:
-  """Returns the strings of a file but for its docstrings."""
-  docs = set()
-  for node in nodes(path):
-    body = getattr(node, "body", None)
-    if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
-      docs.add(id(body[0].value))
-  return [
-    node.value
-    for node in nodes(path)
-    if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs
-  ]
-
-
-@functools.cache
 def imports(types: bool = True) -> list[tuple[str, str, bool]]:
   """Returns (module, what it imports, whether inside a function), of the package and of others.
 

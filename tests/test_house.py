@@ -1,12 +1,10 @@
 """The rules of the house: what may import what, and one place for each thing.
 
-A rule finds its offenders in the source, none of which is run. What does not comply yet is named in
-NOT_YET, and a name that does comply must go from there.
+A rule finds its offenders in the source, none of which is run.
 """
 
 import ast
 import functools
-import pathlib
 import re
 import tomllib
 
@@ -21,14 +19,12 @@ from sources import (
   nodes,
   package_files,
   private_uses,
-  strings,
   suite_files,
 )
 
 # Floors from the ground up; an import leads to the same floor or a lower one.
 FLOORS = ("native", "tissue", "engine", "organ", "batch", "models", "tasks", "app")
-
-NOT_YET: dict[str, set[str]] = {}
+PACKAGE = ("plugin", "models", "tasks")
 
 
 # Imports.
@@ -103,9 +99,6 @@ def mujoco_in_tissue() -> set[str]:
   return {f"{a} -> {b}" for a, b, _ in imports() if floor(a) < 2 and b.partition(".")[0] in engines}
 
 
-# Private names.
-
-
 def private_in_tests() -> set[str]:
   return private_uses(suite_files())
 
@@ -114,31 +107,7 @@ def private_in_the_package() -> set[str]:
   return private_uses(package_files())
 
 
-def private_sources() -> set[str]:
-  """Returns the files but two that import what is private to mujoco_warp or Warp."""
-  allowed = {"plugin/batch/private.py", "plugin/tissue/device.py"}
-  return {name_of(modules()[a]) for a, b, _ in imports() if "._src" in b} - allowed
-
-
 # One place for each thing.
-
-
-def device_switches() -> set[str]:
-  """Returns the files but simd.h and group.h that ask whether they are compiled for CUDA."""
-  allowed = ("plugin/native/core/simd.h", "plugin/native/core/group.h")
-  paths = [p for p in [*package_files(), *headers()] if name_of(p) not in allowed]
-  return {name_of(p) for p in paths if re.search(r"__CUDA_ARCH__|__CUDACC", p.read_text())}
-
-
-def native_in_python() -> set[str]:
-  """Returns the files but the binding that give Warp native code."""
-  return {
-    name_of(path)
-    for path in package_files()
-    if name_of(path) != "plugin/tissue/kernels.py"
-    for node in nodes(path)
-    if isinstance(node, ast.Attribute) and node.attr == "func_native"
-  }
 
 
 def wide_kernels() -> set[str]:
@@ -151,56 +120,6 @@ def wide_kernels() -> set[str]:
         if len(node.args.args) > 4 and any(re.match(r"wp\.kernel\b", mark) for mark in marks):
           found.add(name_of(path))
   return found
-
-
-def writers(pattern: str, *allowed: str) -> set[str]:
-  """Returns the files with a string that matches, but for the allowed ones."""
-  return {
-    name_of(path)
-    for path in package_files()
-    if name_of(path) not in allowed and any(re.search(pattern, text) for text in strings(path))
-  }
-
-
-def calls(pattern: str, paths: list[pathlib.Path], *allowed: str) -> set[str]:
-  """Returns the files that call what matches, but for the allowed ones."""
-  return {
-    name_of(path)
-    for path in paths
-    if name_of(path) not in allowed
-    for node in nodes(path)
-    if isinstance(node, ast.Call) and re.search(pattern, ast.unparse(node.func))
-  }
-
-
-def flexcomp_writers() -> set[str]:
-  probe = "plugin/engine/contacts.py"  # asks MuJoCo by one contact, and knows no models
-  found = writers(r'<flexcomp\s+\w+="', "models/mjcf.py", probe)
-  return found | calls(r"\.add_flex$", package_files(), "plugin/windows.py", "plugin/authoring.py")
-
-
-def flexcomp_in_tests() -> set[str]:
-  """Returns the tests that write an organ's flexcomp; `scenes` is the one builder."""
-  allowed = ("tests/scenes/documents.py", "tests/reference/press_explicit_20us.py")
-  return {
-    name_of(path)
-    for path in suite_files()
-    if name_of(path) not in allowed
-    and any(re.search(r"<flexcomp[^>]*point=", text) for text in strings(path))
-  }
-
-
-def obj_writers() -> set[str]:
-  return writers(r"^(v|f|vn|vt) $|^\n?(v|f) %|newmtl", "models/mjcf.py")
-
-
-def film_writers() -> set[str]:
-  return calls(r"get_writer$|mimsave$|mimwrite$", package_files(), "plugin/app/draw/film.py")
-
-
-def csv_writers() -> set[str]:
-  allowed = ("plugin/app/console.py", "tests/benchmarks/results.py")
-  return calls(r"csv\.(Dict)?[Ww]riter$", [*package_files(), *suite_files()], *allowed)
 
 
 def model_writers() -> set[str]:
@@ -230,15 +149,6 @@ def scheme_comparisons() -> set[str]:
   return found - {"plugin/tissue/step.py"}
 
 
-def version_questions() -> set[str]:
-  """Returns the files of the plugin but mjstruct.py that ask for MuJoCo's version."""
-  found = set()
-  for path in [*below("plugin/engine"), *below("plugin/tissue"), *below("plugin/organ")]:
-    if re.search(r"mujoco\.(__version__|mj_version)", path.read_text()):
-      found.add(name_of(path))
-  return found - {"plugin/engine/model/mjstruct.py"}
-
-
 def literal_offsets() -> set[str]:
   """Returns the files but layout.py with numbers of an index into a state or a box."""
   boxes = r"(plugin_state|inbox|outbox|state)\b"
@@ -262,31 +172,59 @@ RULES = {
   "tissue knows no MuJoCo": mujoco_in_tissue,
   "tests use public names": private_in_tests,
   "modules use public names of each other": private_in_the_package,
-  "private modules of others in one file": private_sources,
-  "device switches": device_switches,
-  "native code in headers": native_in_python,
   "kernels of four arguments": wide_kernels,
-  "one writer of flexcomps": flexcomp_writers,
-  "one builder of test scenes": flexcomp_in_tests,
-  "one writer of OBJ": obj_writers,
-  "one writer of films": film_writers,
-  "one writer of CSV": csv_writers,
   "one file writes to models": model_writers,
   "schemes in one registry": scheme_comparisons,
-  "versions asked for in one file": version_questions,
   "offsets in one table": literal_offsets,
 }
+# What only some files may have in their text: whose files, the pattern, and these files.
+PLACES = {
+  "device switches": (
+    ("plugin",), r"__CUDA_ARCH__|__CUDACC",
+    ("plugin/native/core/simd.h", "plugin/native/core/group.h"),
+  ),
+  "native code in headers": (PACKAGE, r"\.func_native\b", ("plugin/tissue/kernels.py",)),
+  "private modules of others": (
+    PACKAGE, r"(?m)^ *(from|import) .*\._src\b",
+    ("plugin/batch/private.py", "plugin/tissue/device.py"),
+  ),
+  "writers of flexcomps": (
+    PACKAGE, r"<flexcomp\s+\w+=\"|\.add_flex\(",
+    # The second asks MuJoCo by one contact, and knows no models.
+    ("models/mjcf.py", "plugin/engine/contacts.py", "plugin/windows.py", "plugin/authoring.py"),
+  ),
+  "builder of test scenes": (
+    ("tests",), r"<flexcomp[^>{]*point=",
+    ("tests/scenes/documents.py", "tests/reference/press_explicit_20us.py", "tests/test_house.py"),
+  ),
+  "writer of OBJ": (PACKAGE, r"\"[vf] [{%]|\[\"v\",|newmtl", ("models/mjcf.py",)),
+  "writer of films": (
+    PACKAGE, r"\b(get_writer|mimsave|mimwrite)\(", ("plugin/app/draw/film.py",)
+  ),
+  "writer of CSV": (
+    (*PACKAGE, "tests"), r"\bcsv\.(Dict)?[Ww]riter\(",
+    ("plugin/app/console.py", "tests/benchmarks/results.py"),
+  ),
+  "versions asked for": (
+    ("plugin/engine", "plugin/tissue", "plugin/organ"), r"mujoco\.(__version__|mj_version)",
+    ("plugin/engine/model/mjstruct.py",),
+  ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("rule", RULES)
 def test_rule(rule):
-  found, known = RULES[rule](), NOT_YET.get(rule, set())
-  assert found - known == set(), "new offenders"
-  assert known - found == set(), "these comply: take them out of NOT_YET"
+  assert not RULES[rule]()
 
 
-def test_not_yet_names_rules():
-  assert set(NOT_YET) <= set(RULES)
+@pytest.mark.parametrize("place", PLACES)
+def test_place(place):
+  rooms, pattern, allowed = PLACES[place]
+  files = [*package_files(), *headers(), *suite_files()]
+  found = {name_of(path) for path in files if re.search(pattern, path.read_text("utf-8"))}
+  found = {name for name in found if name.startswith(rooms)}
+  assert found <= set(allowed)
+  assert found, "nothing is found: does the pattern still fit?"
 
 
 def test_the_wheel_is_the_package_alone():
