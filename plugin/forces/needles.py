@@ -7,20 +7,17 @@ until that gives way, and leaves holes in it, through which it slides; see `forc
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
-import itertools
 from typing import Any
 
-import mujoco
 import numpy as np
-from palpate.tissue import config as configuration
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import doubles, ints, struct
 
 from ..engine import contacts
 from ..engine.layout import HOLE, HOLES, NEEDLE, PIERCE, TIE
-from ..engine.model import declare, flexes, mjstruct
-from . import transfer
+from ..engine.model import mjstruct
+from . import declare_needles, transfer
 from .declare_attachments import find_body, most
 from .host import Bodies, Host, Input, Nodes, edited, kernels
 from .passive import Force
@@ -30,8 +27,6 @@ _FIRM = 10.0
 # How much farther than they reach contacts with a needle end before a hole, and the least, in a
 # needle's lengths: that of its point.
 _MARGIN, _POINT = 3.0, 0.1
-_BESIDE = 1.4  # the same of a thread beside a hole, to before where contacts begin
-_ENDS = ("swage", "tip")
 _SAME = 1e-6  # edges of a thread within which two places where it goes through are one
 # As in the header.
 _POINTS = HOLES + 1
@@ -167,7 +162,7 @@ class Needles(Force):
     self.count = 1  # a warp a world
     self.names: list[str] = []
     self._shape: dict[str, np.ndarray] = {}
-    self._threads: list[dict] = []  # see `_strand`
+    self._threads: list[dict] = []  # see `declare_needles.strand`
     self._held: dict[int, Any] = {}  # `Held` of the needles that have one
     self._slit = np.zeros(0)  # width of what a tip opens [m]
     self._margin = np.zeros(0)  # see `PIERCE.margin` [m]
@@ -184,16 +179,16 @@ class Needles(Force):
     """
     host, m = self.host, self.host.m
     rows = host.config.needles
-    found = [_read(host, row.name) for row in rows]
+    found = [declare_needles.read(host, row.name) for row in rows]
     if not found:
       return
-    radius = _radius(host)
+    radius = declare_needles.radius(host)
     parts = [part for each in found for part in each["parts"]]
     body = np.array([each["body"] for each in found])
     whose = np.repeat(np.arange(len(found)), [len(each["parts"]) for each in found])
     self._shape = {
       "body": body,
-      "floats": np.array([_is_free(m, b) for b in body], int),
+      "floats": np.array([declare_needles.is_free(m, b) for b in body], int),
       "circle": np.array([each["circle"] for each in found]),
       "half": np.array([each["half"] for each in found]),
       "geom": np.array([g for g, _ in parts]),
@@ -334,7 +329,7 @@ class Needles(Force):
     if not len(nodes):
       raise ValueError(f"{what} has no thread, expected one that `add_needle` has joined")
     line = np.stack([host.body_frame(int(body))[1] for body in nodes])
-    found = sorted(_crossings(line, x[host.organ.mesh.elem]))
+    found = sorted(declare_needles.crossings(line, x[host.organ.mesh.elem]))
     # Through an edge or a corner it goes once.
     rows = [
       row for row, last in zip(found, [(-1.0,), *found], strict=False) if row[0] > last[0] + _SAME
@@ -466,145 +461,3 @@ def _stays(was: Mesh, mesh: Mesh, hole: np.ndarray, slack: float) -> bool:
   way, arm = stop - start, at - start
   share = np.clip((arm * way).sum(axis=1) / (way * way).sum(axis=1), 0, 1)
   return bool((np.linalg.norm(arm - share[:, None] * way, axis=1) > slack).all())
-
-
-def _is_free(m, body: int) -> bool:
-  joint = mjstruct.view(m.body_jntadr, m.nbody, np.int32)[body]
-  kind = mjstruct.view(m.jnt_type, m.njnt, np.int32)
-  return joint >= 0 and kind[joint] == int(mujoco.mjtJoint.mjJNT_FREE)
-
-
-def _read(host: Host, name: str) -> dict[str, Any]:
-  """Returns the arc, the tip and the geoms of a needle."""
-  m, organ = host.m, host.organ
-  body = find_body(host, "needles", name)
-  mine = np.flatnonzero(mjstruct.view(m.site_bodyid, m.nsite, np.int32) == body)
-  sites = {mjstruct.name_of(m, m.name_siteadr, int(site)): site for site in mine}
-  ends = [next((sites[s] for s in sites if s.endswith(f"_{end}")), None) for end in _ENDS]
-  geoms = np.flatnonzero(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32) == body)
-  at = mjstruct.view(m.site_pos, (m.nsite, 3))
-  if None in ends or not len(geoms):
-    raise ValueError(
-      f"organ {organ.name!r}: needles names {name!r}, which has no geoms or no sites '_swage' and "
-      "'_tip', expected a body that `palpate.add_needle` has made"
-    )
-  tip = at[ends[1]]
-  circle, half = float(np.hypot(*tip[:2])), float(np.arctan2(tip[1], tip[0]))
-  size = mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms]
-  middle = mjstruct.view(m.geom_pos, (m.ngeom, 3))[geoms]
-  place = (np.arctan2(middle[:, 1], middle[:, 0]) + half) * circle
-  edge = organ.mesh.whole.edge_length
-  if edge > circle:
-    raise ValueError(
-      f"organ {organ.name!r}: its edges are {1e3 * edge:.3g} mm long in the mean, too long for a "
-      f"bite of needle {name!r}, expected at most its radius, {1e3 * circle:.3g} mm"
-    )
-  turn, origin = flexes.body_frame(m, body)
-  angle = np.linspace(-half, half, 17)
-  arc = origin + circle * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]) @ turn.T
-  if _goes_through((arc - organ.origin) @ organ.frame, organ.mesh):
-    raise ValueError(f"organ {organ.name!r}: needle {name!r} begins in it, expected one outside")
-  return {
-    "body": body, "circle": circle, "half": half, "radius": float(size[:, 0].max()),
-    "strand": _strand(host, body),
-    "slit": 2 * float(mjstruct.view(m.site_size, (m.nsite, 3))[ends[1], 0]),
-    "parts": list(zip(geoms.tolist(), (place + size[:, 1]).tolist(), strict=True)),
-  }  # fmt: skip
-
-
-def _strand(host: Host, needle: int) -> dict[str, Any]:
-  """Returns the thread whose first node an equality joins to a needle, if there is one.
-
-  Returns:
-    flex, or -1; body of each node (n,) and its place there [m] (n, 3); rest length and stiffness of
-    the edge to the next node (n, 2); frame (3, 3) and origin (3,) of its slides;
-    friction; how far from a hole it touches nothing; radius of the largest geom at its end [m]
-  """
-  m, none = host.m, np.zeros((0, 3))
-  out = {"flex": -1, "node": none[:, 0], "local": none, "edges": none[:, :2], "friction": 0.0,
-         "close": 0.0, "bead": 0.0}  # fmt: skip
-  first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
-  size = mjstruct.view(m.geom_size, (m.ngeom, 3))[:, 0]
-  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
-  joined = {
-    int(pair[1 - side])
-    for pair, kind in zip(_pairs(m), mjstruct.view(m.eq_type, m.neq, np.int32), strict=True)
-    for side in range(2)
-    if pair[side] == needle and kind == int(mujoco.mjtEq.mjEQ_CONNECT)
-  }
-  for flex in np.flatnonzero(mjstruct.view(m.flex_dim, m.nflex, np.int32) == 1).tolist():
-    if int(body[first[flex]]) not in joined:
-      continue
-    mine = slice(int(first[flex]), int(first[flex]) + flexes.vertices(m, flex))
-    instance = int(mjstruct.view(m.body_plugin, m.nbody, np.int32)[body[mine][0]])
-    texts = declare.keys(host.model, instance)
-    where = declare.places(m, instance, flex, flexes.name(m, flex))
-    rest, frame, origin = where[1], where[3], where[4]
-    length = np.linalg.norm(np.diff(rest, axis=0), axis=1)
-    young = configuration.parse(flexes.name(m, flex), texts, len(length), closed=False).young
-    thick = float(mjstruct.view(m.flex_radius, m.nflex)[flex])
-    section = np.pi * thick**2
-    edges = np.stack([length, np.asarray(young) * section / length], axis=1)
-    out = {
-      "flex": flex,
-      "node": body[mine].copy(),
-      "local": mjstruct.view(m.flex_vert, (m.nflexvert, 3))[mine].copy(),
-      "edges": np.concatenate([edges, edges[-1:]]),
-      "frame": frame,
-      "origin": origin,
-      "close": _BESIDE * (_radius(host) + thick),
-      "bead": float(
-        size[mjstruct.view(m.geom_bodyid, m.ngeom, np.int32) == body[mine][-1]].max(initial=0.0)
-      ),
-      "friction": float(mjstruct.view(m.flex_friction, (m.nflex, 3))[flex, 0]),
-    }
-  return out
-
-
-def _radius(host: Host) -> float:
-  return float(mjstruct.view(host.m.flex_radius, host.m.nflex)[host.organ.flexes[-1]])
-
-
-def _pairs(m) -> np.ndarray:
-  """Returns the two objects of each equality, (neq, 2)."""
-  ids = [mjstruct.view(array, m.neq, np.int32) for array in (m.eq_obj1id, m.eq_obj2id)]
-  return np.stack(ids, axis=1)
-
-
-def _crossings(line: np.ndarray, x: np.ndarray) -> list[tuple[float, int, float, float, bool]]:
-  """Returns where a line goes through triangles.
-
-  Args:
-    line: its points [m]                   (n, 3)
-    x: corners of the triangles [m]        (nelem, 3, 3)
-
-  Returns:
-    of each place the line's edge plus the share of it, the triangle, the shares of its last two
-    corners, and whether one who comes from the line's end goes against its normal
-  """
-  out = []
-  e, g = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
-  for k, (start, stop) in enumerate(itertools.pairwise(line)):
-    way, r = stop - start, start - x[:, 0]
-    p, q = np.cross(way, g), np.cross(r, e)
-    det = (e * p).sum(axis=1)
-    det = np.where(np.abs(det) > 0, det, np.nan)
-    v, w, t = (r * p).sum(axis=1) / det, (q @ way) / det, (g * q).sum(axis=1) / det
-    found = (v >= 0) & (w >= 0) & (v + w <= 1) & (t >= 0) & (t <= 1)
-    for i in np.flatnonzero(found).tolist():
-      out.append((k + float(t[i]), i, float(v[i]), float(w[i]), bool(det[i] < 0)))
-  return out
-
-
-def _goes_through(line: np.ndarray, mesh: Mesh) -> bool:
-  """Returns whether a line through points [m], (n, 3), goes through a surface or is inside."""
-  x = mesh.rest[mesh.elem]
-  if _crossings(line, x):
-    return True
-  if not mesh.closed:
-    return False
-  a, b, c = np.moveaxis(x - line[0], 1, 0)  # solid angle (van Oosterom and Strackee 1983)
-  la, lb, lc = (np.linalg.norm(each, axis=1) for each in (a, b, c))
-  dots = (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
-  angle = 2 * np.arctan2((a * np.cross(b, c)).sum(axis=1), la * lb * lc + dots).sum()
-  return abs(angle) > 2 * np.pi

@@ -1,11 +1,11 @@
 """Needles in batches: they pierce, hold and are drawn out as under the plugin."""
 
-import forces.test_needles as one
 import mujoco
 import numpy as np
 import palpate.batch
 import pytest
 from devices import needs_cuda
+from scenes import needles as one
 from scenes import press
 
 DEVICES = ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
