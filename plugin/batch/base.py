@@ -44,6 +44,8 @@ class Batch(abc.ABC):
   model: mujoco.MjModel
   nworld: int
   device: Any
+  _organs: Mapping[str, Any]
+  _threads: Mapping[str, Any]
 
   def __init__(self, model: mujoco.MjModel, nworld: int, device):
     self.model, self.nworld, self.device = model, nworld, wp.get_device(device)
@@ -163,9 +165,9 @@ class Batch(abc.ABC):
     """Brings the arrays of the state up to date."""
 
   @property
-  @abc.abstractmethod
-  def organs(self) -> Mapping[str, Tissue]:
-    """The organs by name."""
+  def organs(self) -> dict[str, Any]:
+    """The organs by name, each a `Tissue`."""
+    return dict(self._organs)
 
   def organ(self, name: str) -> Tissue:
     """Returns an organ.
@@ -176,9 +178,9 @@ class Batch(abc.ABC):
     return _listed("organ", self.organs, name)
 
   @property
-  @abc.abstractmethod
-  def threads(self) -> Mapping[str, Thread]:
-    """The threads by name."""
+  def threads(self) -> dict[str, Any]:
+    """The threads by name, each a `Thread`."""
+    return dict(self._threads)
 
   def thread(self, name: str) -> Thread:
     """Returns a thread.

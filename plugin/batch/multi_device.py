@@ -59,11 +59,6 @@ class Several(Batch):
     self._organs = {name: _Gathered(self, name) for name in self.parts[0].organs}
 
   @property
-  def organs(self) -> dict[str, Tissue]:
-    """The organs by name."""
-    return dict(self._organs)
-
-  @property
   def threads(self) -> dict[str, Thread]:
     """Raises ValueError: they are in the parts."""
     raise ValueError("worlds on several devices have their threads in `parts`")
@@ -190,12 +185,10 @@ class _Gathered(Tissue):
 
   @functools.cached_property
   def bonds(self) -> Gathered:
-    """What it has grown on to."""
     return Gathered(self.batch, [part.bonds for part in self._parts])
 
   @property
   def needles(self) -> Needles:
-    """What the needles do that may go through it, see `Tissue`."""
     return Needles(*self._each("needle", [part.needles for part in self._parts]))
 
   def _each(self, name: str, parts: Sequence[Any]) -> list[wp.array]:
@@ -231,17 +224,14 @@ class _Gathered(Tissue):
     return Cutters(*self._each("cutter", [part.cutters for part in self._parts]))
 
   def elem_of(self, world: int) -> np.ndarray:
-    """Returns the triangles of a world, see `Tissue.elem_of`."""
     part, own = self._part(self.batch.index(world))
     return part.elem_of(own)
 
   @property
   def contacts(self) -> Contacts:
-    """Contacts of the last step."""
     return Contacts(*self._each("contact", [part.contacts for part in self._parts]))
 
   def configure(self, mask=None, **keys):
-    """Changes the tissue of worlds, see `Tissue.configure`."""
     batch = self.batch
     rows = {key: spread(self, key, value, batch.nworld) for key, value in keys.items()}
     for part, at, own in batch._each(batch.checked(mask)):

@@ -72,16 +72,6 @@ class Threads(Batch):
     self._organs = {name: _Tissue(self, name, number) for name, number in instances(model).items()}
     self._threads = {name: _Thread(self, name) for name in instances(model, dim=1)}
 
-  @property
-  def organs(self) -> dict[str, Tissue]:
-    """The organs by name."""
-    return dict(self._organs)
-
-  @property
-  def threads(self) -> dict[str, base.Thread]:
-    """The threads by name."""
-    return dict(self._threads)
-
   def each(self, work: Callable[[int], object], worlds=None):
     """Does work(world) for all worlds, or some, on the threads."""
     if os.getpid() != self._pid:
@@ -232,12 +222,10 @@ class _Tissue(Tissue):
 
   @functools.cached_property
   def bonds(self) -> OfThreads:
-    """What it has grown on to."""
     return OfThreads(self.batch, self.handles)
 
   @property
   def needles(self) -> Needles:
-    """What the needles do that may go through it, see `Tissue`."""
     if not self.space.needles:
       raise self._no_needles()
     return gathered([handle.needles for handle in self.handles])
@@ -291,17 +279,14 @@ class _Tissue(Tissue):
     return Cutters(*(wp.array(column, dtype=float, device="cpu") for column in columns))
 
   def meshes(self) -> Sequence[Mesh]:
-    """Returns the mesh of each world, see `Tissue`."""
     for space in self.spaces:
       cutting.follow(space)
     return [space.organ.mesh for space in self.spaces]
 
   def elem_of(self, world: int) -> np.ndarray:
-    """Returns the triangles of a world, see `Tissue.elem_of`."""
     return self.handles[self.batch.index(world)].elem
 
   def configure(self, mask=None, **keys):
-    """Changes the tissue of worlds, see `Tissue.configure`."""
     worlds = np.flatnonzero(self.batch.checked(mask).numpy())
     rows = {key: spread(self, key, value, self.batch.nworld) for key, value in keys.items()}
 
@@ -329,12 +314,10 @@ class _Thread(base.Thread):
 
   @property
   def xpos(self) -> wp.array:
-    """Positions of the nodes [m], (nworld, nnode, 3)."""
     return wp.array([each.positions for each in self.handles], dtype=float, device="cpu")
 
   @property
   def tension(self) -> wp.array:
-    """Tension of each edge [N], (nworld, nnode - 1)."""
     return wp.array([each.tension for each in self.handles], dtype=float, device="cpu")
 
 

@@ -101,6 +101,7 @@ class Worlds(Batch):
         for (name, w), s, t, found in zip(spaces.items(), slots, tools, lines, strict=True)
       }
       self.rods = rods.Rods(self, sewn)
+      self._threads = self.rods.all
       for organ, found in zip(self._organs.values(), lines, strict=True):
         organ.follow([list(self.rods.all.values())[k] for k in found])
       self.aims, self.weighs = self._join()
@@ -373,16 +374,6 @@ class Worlds(Batch):
   def _set_state(self, world: int, data: mujoco.MjData):
     self._check_own(data)
     states.push(self, world, data)
-
-  @property
-  def organs(self) -> dict[str, Organ]:
-    """The organs by name."""
-    return dict(self._organs)
-
-  @property
-  def threads(self) -> dict[str, rods.Thread]:
-    """The threads by name."""
-    return dict(self.rods.all)
 
   @property
   def kept(self) -> tuple[np.ndarray, np.ndarray]:
