@@ -1,8 +1,11 @@
 """What came of it: errors, grasps, targets and traces."""
 
+import functools
+import inspect
 import itertools
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +17,20 @@ from .samples import rows, same
 EVENTS = ("target", "miss", "drop", "unintended_contact", "slip", "note")
 SUCCESS = "success"  # how an exercise ends that was done
 ERRORS = ("miss", "drop", "unintended_contact")
+
+
+def _last(function: Callable[..., Any]) -> Callable[..., float]:
+  """Lets a metric be the last number of its column, (nstep,): of what is told of an episode so far.
+
+  The column is that of the function's argument; the function has no body.
+  """
+  (column,) = inspect.signature(function).parameters
+
+  @functools.wraps(function)
+  def last(*values: Any, **named: Any) -> float:
+    return float(rows(column, *values, *named.values())[-1])
+
+  return last
 
 
 def count_events(kinds: Iterable[str], wanted: Iterable[str]) -> float:
@@ -76,135 +93,84 @@ def target_error(target_distance: ArrayLike) -> float:
 
 
 @metric("Share freed", "-", "outcome", "all", "VTE: teasing (Kotamraju 2008)", better="neither")
-def share_freed(freed: ArrayLike) -> float:
+@_last
+def share_freed(freed: ArrayLike):
   """Returns the share of the bonds' area that came free as it should [-], neither is better.
 
   A success has what was wanted: more of it, or just that, tells nothing.
-
-  Args:
-    freed: share so far [-]  (nstep,)
   """
-  return float(rows("freed", freed)[-1])
 
 
 @metric("Mean deviation", "m", "outcome", "all", "FLS: 2 mm, 10.1177/1553350607302329")
-def cut_deviation(deviation: ArrayLike) -> float:
-  """Returns the mean distance of a cut from its line [m], lower is better (FLS).
-
-  Args:
-    deviation: mean so far [m]  (nstep,)
-  """
-  return float(rows("deviation", deviation)[-1])
+@_last
+def cut_deviation(deviation: ArrayLike):
+  """Returns the mean distance of a cut from its line [m], lower is better (FLS)."""
 
 
 @metric("Largest deviation", "m", "outcome", "max", "FLS: 2 mm, 10.1177/1553350607302329")
-def cut_farthest(farthest: ArrayLike) -> float:
-  """Returns the largest distance of a cut from its line [m], lower is better (FLS).
-
-  Args:
-    farthest: largest so far [m]  (nstep,)
-  """
-  return float(rows("farthest", farthest)[-1])
+@_last
+def cut_farthest(farthest: ArrayLike):
+  """Returns the largest distance of a cut from its line [m], lower is better (FLS)."""
 
 
 @metric("Excess tissue", "m^2", "outcome", "all", "MISTELS: area of deviation")
-def cut_excess(excess: ArrayLike) -> float:
-  """Returns the area between a cut and its line [m^2], lower is better (MISTELS).
-
-  Args:
-    excess: so far [m^2]  (nstep,)
-  """
-  return float(rows("excess", excess)[-1])
+@_last
+def cut_excess(excess: ArrayLike):
+  """Returns the area between a cut and its line [m^2], lower is better (MISTELS)."""
 
 
 @metric("Jagged length", "m", "outcome", "all", "FLS: 2 mm, 10.1177/1553350607302329")
-def cut_jagged(jagged: ArrayLike) -> float:
-  """Returns the length of a cut more than 2 mm from its line [m], lower is better (FLS).
-
-  Args:
-    jagged: so far [m]  (nstep,)
-  """
-  return float(rows("jagged", jagged)[-1])
+@_last
+def cut_jagged(jagged: ArrayLike):
+  """Returns the length of a cut more than 2 mm from its line [m], lower is better (FLS)."""
 
 
 @metric("Depth of the blade", "m", "safety", "max", "this project: what lies under a wall")
-def cut_depth(depth: ArrayLike) -> float:
-  """Returns how far the blade's tip was under the wall that it cut [m], lower is better.
-
-  Args:
-    depth: largest so far [m]  (nstep,)
-  """
-  return float(rows("depth", depth)[-1])
+@_last
+def cut_depth(depth: ArrayLike):
+  """Returns how far the blade's tip was under the wall that it cut [m], lower is better."""
 
 
 @metric("Time of current", "s", "safety", "all", "10.1007/s00464-013-3297-1: cautery time")
-def current_time(current: ArrayLike) -> float:
-  """Returns how long a current was on [s], lower is better.
-
-  Args:
-    current: time so far [s]  (nstep,)
-  """
-  return float(rows("current", current)[-1])
+@_last
+def current_time(current: ArrayLike):
+  """Returns how long a current was on [s], lower is better."""
 
 
 @metric("Current without a target", "s", "safety", "all", "as `current_time`")
-def current_wasted(idle_current: ArrayLike) -> float:
-  """Returns how long a current was on without touching what it is to free [s], lower is better.
-
-  Args:
-    idle_current: time so far [s]  (nstep,)
-  """
-  return float(rows("idle_current", idle_current)[-1])
+@_last
+def current_wasted(idle_current: ArrayLike):
+  """Returns how long a current was on without touching what it is to free [s], lower is better."""
 
 
 @metric("Grasps of the needle", "count", "efficiency", "all", "GEARS: 10.1016/j.juro.2011.09.032")
-def regrasps(regrasped: ArrayLike) -> float:
-  """Returns how often a hand took the needle [count], lower is better.
-
-  Args:
-    regrasped: times so far  (nstep,)
-  """
-  return float(rows("regrasped", regrasped)[-1])
+@_last
+def regrasps(regrasped: ArrayLike):
+  """Returns how often a hand took the needle [count], lower is better."""
 
 
 @metric("Contact with rings", "s", "safety", "all", "this project; as `shaft_contact`")
-def ring_contact(ring_time: ArrayLike) -> float:
-  """Returns how long needle or instruments touched the rings [s], lower is better.
-
-  Args:
-    ring_time: time so far [s]  (nstep,)
-  """
-  return float(rows("ring_time", ring_time)[-1])
+@_last
+def ring_contact(ring_time: ArrayLike):
+  """Returns how long needle or instruments touched the rings [s], lower is better."""
 
 
 @metric("Peak force on rings", "N", "safety", "all", "this project; as `peak_force`")
-def peak_ring_force(ring_force: ArrayLike) -> float:
-  """Returns the largest force on the rings [N], lower is better.
-
-  Args:
-    ring_force: largest so far [N]  (nstep,)
-  """
-  return float(rows("ring_force", ring_force)[-1])
+@_last
+def peak_ring_force(ring_force: ArrayLike):
+  """Returns the largest force on the rings [N], lower is better."""
 
 
 @metric("Depth of the bite", "m", "outcome", "all", "FLS task 4: bites", better="neither")
-def bite_depth(bite: ArrayLike) -> float:
-  """Returns how deep a needle went under a wall [m], neither is better.
-
-  Args:
-    bite: deepest so far [m]  (nstep,)
-  """
-  return float(rows("bite", bite)[-1])
+@_last
+def bite_depth(bite: ArrayLike):
+  """Returns how deep a needle went under a wall [m], neither is better."""
 
 
 @metric("Gap of the cut", "m", "outcome", "all", "FLS tasks 4 and 5: at most 1 mm")
-def final_gap(gap: ArrayLike) -> float:
-  """Returns how far the cut gapes at its widest in the end [m], lower is better.
-
-  Args:
-    gap: at its widest [m]  (nstep,)
-  """
-  return float(rows("gap", gap)[-1])
+@_last
+def final_gap(gap: ArrayLike):
+  """Returns how far the cut gapes at its widest in the end [m], lower is better."""
 
 
 @metric("Peak tension of the thread", "N", "safety", "all", "this project; as `peak_force`")
@@ -218,23 +184,15 @@ def peak_tension(tension: ArrayLike) -> float:
 
 
 @metric("Tearing of holes", "m", "safety", "all", "FLS tasks 4 and 5: no avulsion")
-def tearing(torn: ArrayLike) -> float:
-  """Returns how far a hole of needle or thread has torn through tissue [m], lower is better.
-
-  Args:
-    torn: the farthest so far [m]  (nstep,)
-  """
-  return float(rows("torn", torn)[-1])
+@_last
+def tearing(torn: ArrayLike):
+  """Returns how far a hole of needle or thread has torn through tissue [m], lower is better."""
 
 
 @metric("Knot security", "N", "outcome", "all", "FLS tasks 4 and 5: security", better="neither")
-def knot_security(security: ArrayLike) -> float:
-  """Returns the pull on a slit that its knot has held [N], neither is better.
-
-  Args:
-    security: so far; 0 before the test [N]  (nstep,)
-  """
-  return float(rows("security", security)[-1])
+@_last
+def knot_security(security: ArrayLike):
+  """Returns the pull on a slit that its knot has held [N], neither is better."""
 
 
 @metric("Tracing error (Frechet)", "m", "outcome", "all", "Perk Tutor; Eiter and Mannila 1994")
