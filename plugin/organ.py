@@ -37,14 +37,8 @@ class Organ:
   """
 
   def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, name: str):
-    organs = instances(model)
-    if name not in organs:
-      have = ", ".join(repr(key) for key in organs) or "none"
-      raise ValueError(f"no organ {name!r} in the model, it has {have}")
-    self.model = model
-    self.data = data
-    self.name = name
-    self._space = engine.find(data._address, organs[name])
+    self.model, self.data, self.name = model, data, name
+    self._space = engine.find(data._address, instance_of(model, "organ", name))
 
   @property
   def _organ(self):
@@ -469,6 +463,15 @@ def instances(model: mujoco.MjModel, dim: int = 2) -> dict[str, int]:
     for flex, instance in found.items()
     if instance is not None
   }
+
+
+def instance_of(model: mujoco.MjModel, kind: str, name: str) -> int:
+  """Returns the plugin instance of an `organ` or a `thread`; ValueError lists those there are."""
+  found = instances(model, dim=1 if kind == "thread" else 2)
+  if name not in found:
+    have = ", ".join(map(repr, found)) or "none"
+    raise ValueError(f"no {kind} {name!r} in the model, it has {have}")
+  return found[name]
 
 
 def _instance(model: mujoco.MjModel, flex: int) -> int | None:

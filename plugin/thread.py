@@ -10,7 +10,7 @@ import numpy as np
 from . import authoring, windows
 from .attributes import CONTACT, text
 from .engine import plugin as engine
-from .organ import instances
+from .organ import instance_of
 from .tissue import config as configuration
 from .tissue import rod
 from .tissue.sutures import DIAMETER, SUTURES
@@ -111,12 +111,8 @@ class Thread:
   """
 
   def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, name: str):
-    threads = instances(model, dim=1)
-    if name not in threads:
-      have = ", ".join(repr(key) for key in threads) or "none"
-      raise ValueError(f"no thread {name!r} in the model, it has {have}")
     self.model, self.data, self.name = model, data, name
-    self._space = engine.find_thread(data._address, threads[name])
+    self._space = engine.find_thread(data._address, instance_of(model, "thread", name))
 
   @property
   def positions(self) -> np.ndarray:

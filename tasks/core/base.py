@@ -102,6 +102,7 @@ class Task(engine.Task):
   outcome: str | None = None
   events: list[Event]
   targets = 1
+  mark_radius = 0.003  # of the pictures' marks [m]
   clearance = (0.03, 0.045)  # from the place of work to the tip, where an episode begins [m]
 
   def __init__(
@@ -293,7 +294,7 @@ class Task(engine.Task):
 
   def mark_size(self, k: int) -> float:
     """Returns the radius of a mark [m]."""
-    return 0.003
+    return self.mark_radius
 
   def label(self, kind: str) -> str:
     """Returns what an event of the rules is called, see `event`."""

@@ -268,6 +268,7 @@ class Cut(Task):
   """Cut out a marked piece."""
 
   watch = ("miss", "unintended_contact")
+  mark_radius = 0.0009
   rules = Rules(
     State,
     advance,
@@ -339,10 +340,6 @@ class Cut(Task):
     self.inside, self.travelled, self.seat = cutter(physics)
     self.done, self.next, self.covered, self.nearest = 0, 0, 0.0, 0.0
     self.distance0 = distance(physics, self)
-
-  def mark_size(self, k: int) -> float:
-    """Returns the radius of a mark [m]."""
-    return 0.0009
 
   def label(self, kind: str) -> str:
     """Returns what damage is."""

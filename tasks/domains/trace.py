@@ -279,6 +279,7 @@ class Trace(Task):
   """Follow a curve in light contact."""
 
   watch = ("miss", "unintended_contact", "drop")
+  mark_radius = 0.0015
   rules = Rules(State, advance, observe, ("target", "ahead"), shaping=shaping, mark=mark)
 
   def __init__(
@@ -324,10 +325,6 @@ class Trace(Task):
     self.tracing, self.touching = False, False
     self.now, self.count = self.curve, len(self.curve)
     self.distance0 = distance(physics, self)
-
-  def mark_size(self, k: int) -> float:
-    """Returns the radius of a mark [m]."""
-    return 0.0015
 
   def _draw(self, physics: Physics, center: np.ndarray, size: float):
     """Returns points, triangles and weights in them; None where the curve leaves the place."""

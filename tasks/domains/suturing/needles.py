@@ -199,14 +199,11 @@ class Stitching(Needlework):
   pull: float
   tolerance: float
   misses: np.ndarray
+  mark_radius = MARK
 
   def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
     """Returns all of the wall, and its middle."""
     return np.arange(len(physics.organ.elem)), np.zeros(3)
-
-  def mark_size(self, k: int) -> float:
-    """Returns the radius of a mark [m]."""
-    return MARK
 
   def label(self, kind: str) -> str:
     """Returns what an event of the rules is called."""

@@ -229,6 +229,7 @@ def mark(s, o, k):
 class Transfer(Needlework):
   """Pass a needle through rings, from hand to hand."""
 
+  mark_radius = 0.0015
   rules = Rules(
     State,
     advance,
@@ -306,10 +307,6 @@ class Transfer(Needlework):
     self.done, self.entered, self.passed, self.through = 0, 0, False, 0.0
     self.scraping = self.worst = 0.0
     self.error0 = float(np.linalg.norm(end - self.middles[0]))
-
-  def mark_size(self, k: int) -> float:
-    """Returns the radius of a mark [m]."""
-    return 0.0015
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns how often the needle was grasped anew, and what it did to the rings."""

@@ -1,4 +1,4 @@
-"""Times the implicit step alone, device by device, and checks CUDA against the CPU first.
+"""Times the implicit step alone, device by device.
 
     palpate bench solver --device cuda:0 --nodes 678 16386 65538 262146
 
@@ -17,7 +17,6 @@ import scenes
 import warp as wp
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
-from palpate.app.console import CommandError
 from palpate.models.meshing import grid
 from palpate.tissue import body as bodies
 from palpate.tissue import coarse, config
@@ -30,14 +29,6 @@ from palpate.tissue.types import NUMBERS, Stage
 H = 1e-3
 MASS = 0.1
 RADIUS = 0.05
-VARIANTS = {
-  "membrane": {"bend": 0.0},
-  "bending": {},
-  "closed": {"bulk": 1e4, "pressure": 50.0, "foundation": 1e4},
-  "newton": {"newton": 3},
-  "spring": {"elements": "spring", "stiffness": 200.0, "bend": 0.0},
-  "stiff": {"young": (3e6,)},
-}
 PRECONDITIONERS = {"jacobi": np.inf, "multilevel": 0.0}  # condition number to use cycles from
 
 
@@ -74,36 +65,6 @@ def record(body: Body, work) -> wp.Graph:
   with wp.ScopedDevice(body.device), wp.ScopedCapture(device=body.device) as capture:
     work()
   return capture.graph
-
-
-def agreement(device: str) -> float:
-  """Returns the largest relative difference from the CPU over all variants, printing each."""
-  shape = sphere(578)
-  rng = np.random.RandomState(0)
-  u = 5e-4 * rng.standard_normal(shape.rest.shape)
-  v = 0.05 * rng.standard_normal(shape.rest.shape)
-  worst = 0.0
-  for name, keys in VARIANTS.items():
-    for kind, threshold in PRECONDITIONERS.items():
-      results = []
-      for where in ("cpu", device, device):
-        body = make(shape, where, tolerance=1e-6, iterations=1000, **keys)
-        body.levels.transfer.threshold = threshold
-        for field, values in (("disp", u), ("vel", v), ("force_ext", load(shape))):
-          scenes.put(body, getattr(body.state, field), values)
-        stepping.step(body)
-        status = body.system.status.numpy()[0].copy()
-        results.append((scenes.get(body, body.state.dvel), status))
-      free = np.linalg.norm(results[0][0])
-      difference = np.linalg.norm(results[0][0] - results[1][0]) / free
-      repeats = np.array_equal(results[1][0], results[2][0])
-      worst = max(worst, difference if repeats else np.inf)
-      print(
-        f"{name:10s} {kind:10s} difference {difference:.2e}, repeats to the bit: {repeats}, "
-        f"iterations {results[0][1][0]:.0f} / {results[1][1][0]:.0f}",
-        flush=True,
-      )
-  return worst
 
 
 def measure(device: str, nodes: int, tolerance: list[float], bend: float, args) -> list[dict]:
@@ -210,12 +171,6 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   ]
 
 
-def begin(args: argparse.Namespace):
-  """Checks the device against the CPU."""
-  if args.device != "cpu" and agreement(args.device) > 1e-4:
-    raise CommandError(f"{args.device} disagrees with the CPU", code=1)
-
-
 def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Returns the rows of a size."""
   args = argparse.Namespace(**case)
@@ -273,5 +228,5 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   return [picture, page]
 
 
-BENCH = Bench("solver", stages, run, report=report, arguments=arguments, begin=begin,
+BENCH = Bench("solver", stages, run, report=report, arguments=arguments,
               file="solver_{device}")  # fmt: skip
