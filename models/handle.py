@@ -206,6 +206,9 @@ class Shaft:
     turn = (cp * a - sp * b, cp * b + sp * a, cp * c - sp * d, cp * d + sp * c)
     return times(self._quat, turn)
 
+  def lean(self, turn: Vector, pos: Vector, roll: float = 0.0) -> None:
+    """Turns a wrist by a rotation vector of the world [rad]  (3,); without one nothing turns."""
+
   def roll(self, pos: Vector, quat: Vector) -> float:
     """Returns the angle about the shaft of an orientation with the tip at a point [rad]."""
     w, x, y, z = self.quat(pos)
@@ -215,17 +218,27 @@ class Shaft:
 
 
 class Wrist(Shaft):
-  """How the tip of an instrument with a wrist stands: as it did, turned about its jaws."""
+  """How the tip of an instrument with a wrist stands: as it did, turned about its jaws, leant."""
 
   def __init__(self, trocar: ports.Trocar, quat: Vector):
     """Takes the instrument's trocar and how the tip stands, w x y z  (4,)."""
     super().__init__(trocar)
     w, x, y, z = (float(q) for q in quat)
-    self._start: Quat = (w, x, y, z)
+    self._port, self._start = trocar, (w, x, y, z)
 
   def quat(self, pos: Vector, roll: float = 0.0) -> Quat:
     """See `Shaft`; the place makes no difference."""
     return times(self._start, (math.cos(roll / 2), 0.0, 0.0, -math.sin(roll / 2)))
+
+  def lean(self, turn: Vector, pos: Vector, roll: float = 0.0) -> None:
+    """See `Shaft`; it goes as far as the joints do with the tip at a point [m]  (3,)."""
+    quat = np.array([1.0, 0.0, 0.0, 0.0])
+    mujoco.mju_quatIntegrate(quat, np.array(turn), 1.0)
+    w, x, y, z = quat.tolist()
+    leant = matrix(np.array(times((w, x, y, z), self.quat(pos, roll))))
+    _, found = wrist.forward(self._port, wrist.inverse(self._port, pos, leant))
+    w, x, y, z = ports.orientation(found).tolist()
+    self._start = times((w, x, y, z), (math.cos(roll / 2), 0.0, 0.0, math.sin(roll / 2)))
 
 
 def pose(trocar: ports.Trocar, pos: Vector, roll: float = 0.0) -> np.ndarray:

@@ -155,6 +155,7 @@ class Link:
     # Of which a movement is told; what moves nothing but itself begins at its origin.
     self._still = Reading(STILL) if device.relative else None
     self._last: Reading | None = None
+    self._leant = (0.0, 0.0)  # of the last reading
     self.attach(None, STILL, _SAME, np.eye(3))
     self.quiet()
 
@@ -210,7 +211,8 @@ class Link:
     if still is None or last.buttons != still.buttons:
       self._still, pressed = last, bool(last.buttons)
       return pressed
-    away = math.dist(last.pos, still.pos) > _STIRS or abs(last.roll - still.roll) > _TURNS
+    turned = math.dist((last.roll, *last.lean), (still.roll, *still.lean)) > _TURNS
+    away = turned or math.dist(last.pos, still.pos) > _STIRS
     if away:
       self._still = None
     return away
@@ -270,7 +272,9 @@ class Link:
 
   def _take(self, reading: Reading, tip: Sequence[float] | None) -> None:
     """Aims the anchor at what the hand does."""
-    pos, quat, roll, jaw, buttons = self._last = reading
+    pos, quat, roll, jaw, buttons, lean = self._last = reading
+    up, right = lean[0] - self._leant[0], lean[1] - self._leant[1]
+    self._leant = lean
     asks, self._asked = not self._asked, "pause" in buttons
     self.paused ^= asks and self._asked
     self.grip, self.report = "grip" in buttons, "report" in buttons
@@ -304,6 +308,8 @@ class Link:
       shift = [a + b - c for a, b, c in zip(center, held, goal, strict=True)]
       self._reference = first, shift, turned, turn
     self._roll = min(max(turn + roll, -3.1), 3.1)
+    if self._shaft is not None and (up or right):
+      self._shaft.lean([up * m[k] - right * m[k + 1] for k in (0, 3, 6)], self.row[:3], self._roll)
     if quat is not None:
       self._turn.aim(list(_nearest(self._turned(reading, first, turned), self._turn.value)))
     self._place.aim(held)

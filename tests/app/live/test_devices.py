@@ -22,6 +22,9 @@ def test_a_desk_adds_up_what_it_is_told():
   reading = desk.read(1.01)
   assert reading.pos == pytest.approx((0.002, 0.002, -0.06 * 0.01))
   assert reading.roll == pytest.approx(0.1 + 0.01) and reading.buttons == {"clutch"}
+  assert reading.lean == (0.0, 0.0)
+  desk.feed(move=(0, 0, 0, 0, 0.1, 0.2), rate=(0, 0, 0, 0, 0, -1))
+  assert desk.read(1.02).lean == pytest.approx((0.1, 0.2 - 0.01))
   desk.feed(jaw=-0.5)
   assert desk.read(1.02).jaw == -0.5
 
@@ -30,7 +33,7 @@ def test_a_desk_adds_up_what_it_is_told():
   ("what", "said"),
   [
     ({"move": (math.nan, 0, 0, 0)}, "move is"),
-    ({"move": (1, 2)}, "expected 4 numbers"),
+    ({"move": (1, 2)}, "expected 4 or 6 numbers"),
     ({"move": ("1", 0, 0, 0)}, "move is"),
     ({"rate": (2, 0, 0, 0)}, r"rate is .* in \[-1, 1\]"),
     ({"jaw": 3.0}, "jaw is"),

@@ -435,6 +435,46 @@ def test_keys_gamepad_and_buttons_move_the_tip(pages):
 
 
 @pytest.mark.slow
+def test_a_wrist_is_turned_by_mouse_keys_gamepad_and_buttons(pages):
+  page = pages.page
+  page.select_option("#task", "suture/drive_easy")
+  pages.start()
+  axes = "((h) => [h.tip_qw, h.tip_qx, h.tip_qy, h.tip_qz])(window.palpate().head)"
+  up = "[data-rate='4,1']"
+  pad = "[{axes: [0, 0, 0, 0], buttons: Array.from({length: 16}, (_, i) => ({pressed: i == 14}))}]"
+
+  def turned(before):
+    return 2 * np.arccos(min(abs(before @ page.evaluate(axes)), 1.0))
+
+  for on, off in (
+    (lambda: page.keyboard.press("Shift+ArrowUp", delay=300), lambda: None),
+    (lambda: pages.drag(0, -30), lambda: None),
+    (lambda: page.mouse.wheel(0, 300), lambda: None),
+    (
+      lambda: page.evaluate(f"void (window.pads = {pad})"),
+      lambda: page.evaluate("void (window.pads = [])"),
+    ),
+    (
+      lambda: page.dispatch_event(up, "pointerdown"),
+      lambda: page.dispatch_event(up, "pointerup"),
+    ),
+  ):
+    before = np.array(page.evaluate(axes))
+    page.keyboard.down("Shift")
+    on()
+    page.keyboard.up("Shift")
+    for _ in range(int(10 * ANSWER)):
+      page.wait_for_timeout(100)
+      if turned(before) > 0.1:
+        break
+    off()
+    assert turned(before) > 0.1
+  assert page.is_visible(up)
+  pages.stop()
+  page.select_option("#task", "touch/easy")
+
+
+@pytest.mark.slow
 def test_a_program_that_ends_is_named_and_found_again(pages):
   pages.close()
   said = "document.getElementById('fault').textContent.includes('No connection')"

@@ -2,11 +2,14 @@
 
 import math
 
+import mujoco
 import numpy as np
 import palpate
 import pytest
 from palpate.app import live
 from palpate.app.live.devices.relative import Desk
+from palpate.models import trocar, wrist
+from palpate.models.handle import Wrist
 from palpate.tasks import suite
 from palpate.tasks.core import episode
 from palpate.tasks.recording import Recording
@@ -165,6 +168,34 @@ def test_a_needle_stays_in_the_jaws_until_the_hand_has_closed_them_and_opens():
   assert not held[-1][1]
   early = made.columns["quat"][made.time < 0.5, 0]
   np.testing.assert_allclose(np.abs(early @ early[0]), 1.0, atol=1e-4)
+
+
+def test_keys_lean_a_wrist_upwards_and_to_the_right_of_the_picture():
+  """A device without orientation has a second and a third angle; what it leans stops in time."""
+  env = load("suture/drive_easy", input="tip", time_limit=0.3)
+  turned = []
+  for rate in ((0, 0, 0, 0, 1, 0), (0, 0, 0, 0, 0, 1)):
+    desk = Desk()
+    desk.feed(rate=rate)
+    quat = session(env, desk).run().columns["quat"][:, 0]
+    away, both = np.empty(4), np.empty(3)
+    mujoco.mju_mulQuat(away, quat[-1], quat[0] * [1, -1, -1, -1])
+    mujoco.mju_quat2Vel(both, away, 1.0)
+    turned.append(env.physics.camera()[1].T @ both)
+  np.testing.assert_allclose(turned, 0.3 * np.array([[1, 0, 0], [0, -1, 0]]), atol=0.02)
+
+
+def test_a_wrist_leans_as_far_as_its_joints_do():
+  port = trocar.trocar(load("suture/drive_easy", input="tip").physics.model.ptr, "psm/")
+  place, mat = wrist.forward(port, np.zeros(6))
+  found = Wrist(port, trocar.orientation(mat))
+  for _ in range(300):
+    found.lean([0.02, 0.0, 0.0], place)
+  far = found.quat(place)
+  for _ in range(20):
+    found.lean([-0.02, 0.0, 0.0], place)
+  angle = 2 * np.arccos(min(abs(np.dot(far, found.quat(place))), 1.0))
+  assert angle == pytest.approx(0.4, abs=0.01)  # it comes back at once
 
 
 def test_hands_are_as_many_as_the_exercise_takes():

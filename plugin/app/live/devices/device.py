@@ -29,6 +29,7 @@ class Reading(NamedTuple):
     jaw: opening of the jaws, 1 is wide open, -1 squeezes; None where the button `grip` closes them
     buttons: those that are held: `clutch` (the instrument stays while the hand moves), `grip`,
       `report`, `pause`
+    lean: of a wrist, upwards and to the right, where `quat` is None [rad]  (2,)
   """
 
   pos: Three
@@ -36,6 +37,7 @@ class Reading(NamedTuple):
   roll: float = 0.0
   jaw: float | None = None
   buttons: frozenset[str] = frozenset()
+  lean: tuple[float, float] = (0.0, 0.0)
 
 
 class Device(Protocol):
@@ -138,8 +140,8 @@ class Guard:
 
   def check(self, reading: Reading, now: float) -> str:
     """Returns `good`, `jump` for a movement that no hand makes, `bad` for what is no pose."""
-    pos, quat, roll, jaw, _ = reading
-    numbers = pos[0] + pos[1] + pos[2] + roll + sum(quat or ()) + (jaw or 0.0)
+    pos, quat, roll, jaw, _, lean = reading
+    numbers = pos[0] + pos[1] + pos[2] + roll + sum(quat or lean) + (jaw or 0.0)
     if not math.isfinite(numbers) or (quat and sum(q * q for q in quat) < 1e-6):
       pose = f"{pos} {quat or ''}".strip()
       self.last = f"{self._device.name}: pose is {pose}, expected finite numbers"

@@ -9,9 +9,11 @@ from typing import Any
 
 from .device import DeviceError, Reading, Silent, library
 
-SPEED, ROLL = 0.06, 2.0  # of the hand at full deflection [m/s], about the shaft [rad/s]
+# Of the hand at full deflection: place [m/s], about the shaft and of a wrist [rad/s].
+SPEED, ROLL, LEAN = 0.06, 2.0, 1.0
+_FULL = (SPEED, SPEED, SPEED, ROLL, LEAN, LEAN)
 BUTTONS = frozenset({"clutch", "grip", "report", "pause"})
-_MOST = 0.05  # of one movement [m]
+_MOST = (0.05,) * 3 + (math.pi,) * 3  # of one movement [m], [rad]
 _DEAD = 0.08  # share of a stick's way in which nothing moves
 _EVERY = 0.008  # between readings of the hardware [s]
 
@@ -31,12 +33,12 @@ class Desk(Silent):
     self.name = name
     self.step: float | None = None
     self._lock = threading.Lock()
-    self._moved = [0.0] * 4
-    self._rate: Sequence[float] = (0.0,) * 4
+    self._moved = [0.0] * 6
+    self._rate: Sequence[float] = (0.0,) * 6
     self._held: frozenset[str] = frozenset()
     self._jaw: float | None = None
     self._at = 0.0
-    self._pos, self._time = [0.0] * 4, None
+    self._pos, self._time = [0.0] * 6, None
 
   def feed(
     self,
@@ -49,8 +51,9 @@ class Desk(Silent):
     """Takes what the hand does; ValueError says what is no such thing.
 
     Args:
-      move: how far it went since the last call, x y z [m] and about the shaft [rad]  (4,)
-      rate: its speed from now on, in shares of the full one, each in [-1, 1]  (4,)
+      move: how far it went since the last call: x y z [m], about the shaft [rad] and, for a wrist,
+        up and to the right [rad]  (4,) or (6,)
+      rate: its speed from now on, in shares of the full one, each in [-1, 1]  (4,) or (6,)
       buttons: those that are held now, of `BUTTONS`
       jaw: opening of the jaws in [-1, 1], None for the button `grip`
       at: when it was so, by any clock, 1e9 at most
@@ -63,8 +66,8 @@ class Desk(Silent):
       jaw = _numbers("jaw", [jaw] * 4, 1.0)[0]
     at = _numbers("at", [at] * 4, 1e9)[0]
     with self._lock:
-      most = (_MOST, _MOST, _MOST, math.pi)
-      self._moved = [a + min(max(b, -m), m) for a, b, m in zip(self._moved, far, most, strict=True)]
+      sums = zip(self._moved, far, _MOST, strict=True)
+      self._moved = [a + min(max(b, -most), most) for a, b, most in sums]
       self._rate, self._held, self._jaw, self._at = fast, held, jaw, at
 
   def read(self, now: float) -> Reading:
@@ -73,24 +76,22 @@ class Desk(Silent):
     self._time = now
     with self._lock:
       moved, rate, held, jaw = self._moved, self._rate, self._held, self._jaw
-      self._moved, self.stamp = [0.0] * 4, self._at
-    full = (SPEED, SPEED, SPEED, ROLL)
+      self._moved, self.stamp = [0.0] * 6, self._at
     self._pos = [
-      p + m + span * r * f for p, m, r, f in zip(self._pos, moved, rate, full, strict=True)
+      p + m + span * r * f for p, m, r, f in zip(self._pos, moved, rate, _FULL, strict=True)
     ]
-    x, y, z, roll = self._pos
-    return Reading((x, y, z), None, roll, jaw, held)
+    x, y, z, roll, up, right = self._pos
+    return Reading((x, y, z), None, roll, jaw, held, (up, right))
 
 
 def _numbers(name: str, values: Sequence[float], most: float) -> tuple[float, ...]:
-  if not len(values):
-    return (0.0,) * 4
-  good = len(values) == 4 and all(
+  good = len(values) in (0, 4, 6) and all(
     isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= most for v in values
   )
   if not good:
-    raise ValueError(f"{name} is {list(values)!r:.80}, expected 4 numbers in [-{most:g}, {most:g}]")
-  return tuple(float(v) for v in values)
+    allowed = f"expected 4 or 6 numbers in [-{most:g}, {most:g}]"
+    raise ValueError(f"{name} is {list(values)!r:.80}, {allowed}")
+  return (*map(float, values), *[0.0] * (6 - len(values)))
 
 
 def sticks(value: float) -> float:
@@ -117,7 +118,7 @@ class Hardware(Desk):
 
 
 class Gamepad(Hardware):
-  """A gamepad by pygame: left stick across the picture, right stick depth and roll.
+  """A gamepad by pygame: left stick across the picture, right stick depth and roll, hat the wrist.
 
   Buttons: 0 grips, 1 reports, 2 or either shoulder is the clutch, 7 pauses.
   """
@@ -151,9 +152,10 @@ class Gamepad(Hardware):
       raise DeviceError(f"{self.name}: it is gone")
     pad, count = self._pad, self._pad.get_numaxes()
     x, y, u, v = (sticks(pad.get_axis(i)) if i < count else 0.0 for i in (0, 1, 2, 3))
+    right, up = pad.get_hat(0) if pad.get_numhats() else (0, 0)
     down = {i for i in range(pad.get_numbuttons()) if pad.get_button(i)}
     names = {0: "grip", 1: "report", 2: "clutch", 4: "clutch", 5: "clutch", 7: "pause"}
-    self.feed(rate=(x, -y, v, u), buttons={names[i] for i in down & set(names)})
+    self.feed(rate=(x, -y, v, u, up, right), buttons={names[i] for i in down & set(names)})
 
   def close(self) -> None:
     """Lets go of it."""

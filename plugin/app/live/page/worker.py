@@ -335,6 +335,7 @@ class Worker:
       task = env.task
       limits = {"force_limit": task.force_limit, "damage": task.damage, "jaws": task.jaws}
       limits |= {"scope": session.scope is not None, "turns": "head" in task.extra}
+      limits["wrist"] = any(hand.trocar().wrist for hand in env.physics.hands)
       self._tell(self._camera.shapes(
         time_limit=env.step_limit * env.control_timestep(), report="report" in task.extra,
         assessment=self._job["assessment"], practice=False, step=env.physics.timestep(), **limits,
@@ -382,7 +383,7 @@ class Worker:
       self._tell(camera.shapes(
         force_limit=LIMIT, damage=DAMAGE, jaws=self._job["instrument"] != "probe", time_limit=None,
         report=False, assessment=False, practice=True, step=1e-3 * self._job["step"],
-        scope=practice.scope is not None, turns=False,
+        scope=practice.scope is not None, turns=False, wrist=False,
       ))  # fmt: skip
     self._follow(camera)
     self._publish(lambda: camera.frame(practice.link, practice.pace, powered=practice.powered))

@@ -1,5 +1,7 @@
-// What the hands do: mouse, touch, keys, buttons and gamepad, as displacements [m] and speeds.
+// What the hands do: mouse, touch, keys, buttons and gamepad, as displacements [m] and speeds: to the right, up, towards
+// the person, about the shaft and, of a wrist, up and to the right.
 
+const AXES = 6, WRIST = 4;  // of them, where those of a wrist begin
 const KEYS = {
   ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowDown: [1, -1], ArrowUp: [1, 1], a: [0, -1], d: [0, 1],
   s: [1, -1], w: [1, 1], q: [2, -1], e: [2, 1], z: [3, -1], x: [3, 1],
@@ -11,19 +13,20 @@ const TILT = {b: 1, v: -1};  // of the camera, against the scope
 const HOLD = {g: "grip", " ": "grip", r: "report", c: "clutch"};
 const DEPTH = 2e-5;  // of the wheel [m]
 const PINCH = 3e-4;  // of two fingers [m]
-const ROLL = 0.01;  // [rad]
-const MOST = 0.04;  // in a message [m]
+const ROLL = 0.01, TURN = 1e-3;  // of a drag and of the wheel [rad]
+const MOST = [0.04, 0.04, 0.04, 3, 3, 3];  // in a message [m], [rad]
 const DEAD = 0.1;
 const MOVES = "onpointerrawupdate" in window ? "pointerrawupdate" : "pointermove";  // the latter waits for a picture
 const CALM = 0.5;  // share of a hand's speed that the laparoscope's keys have
 const TILTS = 0.2;  // of the camera, half turns a second
+const still = () => Array(AXES).fill(0);
 export const CLOCK = 1e6;  // in which the clock of messages goes round [ms]
 
 export class Hand {
   constructor(canvas, pad, view, head) {
     this.view = view;
     this.head = head;
-    this.move = [0, 0, 0, 0];
+    this.move = still();
     this.down = new Set();
     this.grip = false;
     this.fingers = new Map();
@@ -33,6 +36,7 @@ export class Hand {
     this.left = "";  // what is in the left hand: keyboard, pad
     this.scope = false;  // whether what moves the instrument moves the laparoscope
     this.turns = false;  // whether the instrument itself is one, whose camera turns
+    this.wrist = false;  // whether it has one
     this.begin();
     canvas.addEventListener("pointerdown", event => this.press(canvas, event));
     canvas.addEventListener(MOVES, event => this.drag(event));
@@ -108,6 +112,7 @@ export class Hand {
       this.move[3] += Math.atan2(Math.sin(now.angle - before.angle), Math.cos(now.angle - before.angle));
     } else if (event.shiftKey) {
       this.move[3] += ROLL * x;
+      if (this.wrist) this.move[WRIST] -= ROLL * y;
     } else {
       const size = view.pixel(this.head());
       this.move[0] += size * x;
@@ -125,29 +130,32 @@ export class Hand {
     event.preventDefault();
     this.since ??= event.timeStamp;
     if (this.view.free) this.view.scale(Math.exp(1e-3 * event.deltaY));
+    else if (this.wrist && event.shiftKey) this.move[WRIST + 1] += TURN * (event.deltaY || event.deltaX);
     else this.move[2] += DEPTH * event.deltaY;
   }
 
   key(event, down) {
     const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-    if (![KEYS, HOLD, SCOPE, TILT].some(keys => name in keys)) return;
+    if (name !== "Shift" && ![KEYS, HOLD, SCOPE, TILT].some(keys => name in keys)) return;
     event.preventDefault();
     if (down) this.down.add(name);
     else this.down.delete(name);
   }
 
   keys() {
-    const rate = [0, 0, 0, 0], held = [];
+    const rate = still(), held = [], turned = this.wrist && this.down.has("Shift");
     for (const name of this.down) {
-      if (name in KEYS) rate[KEYS[name][0]] += KEYS[name][1];
-      else if (name in HOLD) held.push(HOLD[name]);
+      if (name in KEYS) {
+        const [axis, way] = KEYS[name];
+        rate[turned && axis < 2 ? WRIST + 1 - axis : axis] += way;
+      } else if (name in HOLD) held.push(HOLD[name]);
     }
     return {rate, held};
   }
 
   // Keys that move the laparoscope.
   view_keys() {
-    const rate = [0, 0, 0, 0];
+    const rate = still();
     for (const name of this.down) if (name in SCOPE) rate[SCOPE[name][0]] += CALM * SCOPE[name][1];
     return {rate, held: []};
   }
@@ -161,18 +169,20 @@ export class Hand {
   }
 
   pads() {
-    const rate = [0, 0, 0, 0], held = [];
+    const rate = still(), held = [];
     for (const pad of navigator.getGamepads?.() ?? []) {
       if (!pad) continue;
       const stick = i => Math.abs(pad.axes[i] ?? 0) < DEAD ? 0 : pad.axes[i];
       [stick(0), -stick(1), stick(3), stick(2)].forEach((value, i) => rate[i] += value);
+      const cross = i => Number(pad.buttons[i]?.pressed ?? 0);  // up, down, left, right
+      if (this.wrist) [cross(12) - cross(13), cross(15) - cross(14)].forEach((way, i) => rate[WRIST + i] += way);
       ["grip", "report", "clutch"].forEach((name, i) => pad.buttons[i]?.pressed && held.push(name));
     }
     return {rate, held};
   }
 
   buttons() {
-    const rate = [0, 0, 0, 0], held = this.grip ? ["grip"] : [];
+    const rate = still(), held = this.grip ? ["grip"] : [];
     for (const {dataset} of this.pressed) {
       if (dataset.hold) held.push(dataset.hold);
       else if (dataset.rate) {
@@ -186,26 +196,26 @@ export class Hand {
   // Returns what to tell.
   say() {
     const {left} = this, keys = this.keys(), pads = this.pads(), right = [this.buttons()];
-    const move = this.move.map((x, i) => Math.min(Math.max(x, i < 3 ? -MOST : -3), i < 3 ? MOST : 3));
-    this.move = [0, 0, 0, 0];
+    const move = this.move.map((x, i) => Math.min(Math.max(x, -MOST[i]), MOST[i]));
+    this.move = still();
     if (left !== "keyboard") right.push(keys);
     if (left !== "pad") right.push(pads);
     this.lean();
     const views = [this.view_keys()];
     if (this.scope) views.push(...right);
-    const none = [0, 0, 0, 0], tilt = this.tilt;
+    const none = still(), tilt = this.tilt;
     const out = [this.words("scope", views, this.scope ? move : none, tilt)];
     if (this.scope) out.push(this.words("right", [], none));
     else out.push(this.words("right", right, move, this.turns ? tilt : undefined));
-    if (left === "keyboard") out.push(this.words("left", [keys], [0, 0, 0, 0]));
-    if (left === "pad") out.push(this.words("left", [pads], [0, 0, 0, 0]));
+    if (left === "keyboard") out.push(this.words("left", [keys], none));
+    if (left === "pad") out.push(this.words("left", [pads], none));
     this.since = null;
     return out.filter(Boolean);
   }
 
   // Returns the message about a hand, null where nothing is new.
   words(which, sources, move, jaw) {
-    const rate = [0, 1, 2, 3].map(i => Math.min(Math.max(sources.reduce((sum, s) => sum + s.rate[i], 0), -1), 1));
+    const rate = still().map((_, i) => Math.min(Math.max(sources.reduce((sum, s) => sum + s.rate[i], 0), -1), 1));
     const buttons = [...new Set(sources.flatMap(s => s.held))], rest = JSON.stringify([rate, buttons, jaw]);
     if (rest === this.said[which] && move.every(x => x === 0)) return null;
     this.said[which] = rest;

@@ -136,7 +136,7 @@ const HEAR = {
     $("pad-report").hidden = !scene.report;
     $("scope").hidden = $("follow").hidden = !scene.scope;
     tilts();
-    hand.turns = scene.turns;
+    [hand.turns, hand.wrist] = [scene.turns, scene.wrist];
     hand.begin();
     press("draw", false);
     if (!scene.scope) press("scope", false);
@@ -424,9 +424,10 @@ const beep = speaker(() => $("sound").checked);
 
 // The buttons.
 
-// Buttons that turn a camera are there while one is moved.
+// Buttons that turn a camera or a wrist are there while one is moved.
 function tilts() {
   for (const button of document.querySelectorAll("[data-tilt]")) button.hidden = !hand.scope && !scene?.turns;
+  for (const button of document.querySelectorAll("[data-wrist]")) button.hidden = hand.scope || !scene?.wrist;
 }
 const pressed = (id, on) => $(id).setAttribute("aria-pressed", on);
 const on = id => $(id).getAttribute("aria-pressed") === "true";

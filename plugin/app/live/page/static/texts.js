@@ -19,6 +19,9 @@ const GERMAN = {
     "Tasten: Pfeile oder W A S D bewegen im Bild, Q weg und E heran, Z und X drehen. G schließt die Backen, R meldet, C kuppelt, P hält an, H zeigt die Könnerin.",
   "Gamepad: the left stick moves across the picture, the right stick sets depth and roll. The first button grips, the second reports, the third is the clutch.":
     "Gamepad: der linke Stick bewegt im Bild, der rechte stellt Tiefe und Drehung. Der erste Knopf greift, der zweite meldet, der dritte kuppelt.",
+  "Needle drivers have a wrist: with Shift, the arrows or a drag up and down tilt the jaws, and the arrows or the wheel turn them sideways. On a gamepad the cross does both. Z and X roll them.":
+    "Nadelhalter haben ein Handgelenk: mit Umschalt neigen die Pfeiltasten oder Ziehen auf und ab die Backen, und die Pfeiltasten oder das Rad drehen sie zur Seite. Am Gamepad tut beides das Kreuz. Z und X rollen sie.",
+  "tilt the jaws up": "Backen nach oben neigen", "tilt the jaws down": "Backen nach unten neigen", "turn the jaws left": "Backen nach links drehen", "turn the jaws right": "Backen nach rechts drehen",
   "Laparoscope: I J K L move it across the picture, U in and O out, N and M roll the scope, V and B turn the camera. F lets it follow the tip. With Y, or Camera, everything above moves the laparoscope.":
     "Laparoskop: I J K L bewegen es im Bild, U hinein und O heraus, N und M drehen die Optik, V und B die Kamera. Mit F folgt es der Spitze. Mit Y, oder Kamera, bewegt alles Obige das Laparoskop.",
   "Free view: drag to rotate the picture. Two fingers, or Shift and drag, pan it. The wheel or a pinch zooms. Keys and gamepad still move the instrument.":
@@ -96,7 +99,7 @@ const GERMAN = {
   "Move the tip to the right": "Bewege die Spitze nach rechts", "Move it back to the left": "Bewege sie zurück nach links", "Move it up": "Bewege sie nach oben",
   "Move it down": "Bewege sie nach unten", "Go deeper, away from you": "Geh tiefer, von dir weg", "Come back towards you": "Komm zurück, auf dich zu",
   "Roll the instrument": "Drehe das Instrument", "Touch the organ gently and watch the force": "Berühre das Organ sanft und sieh auf die Kraft", "Let go of it": "Löse dich von ihm",
-  "Well done. Go on as you like, or press Stop and begin with the first exercise": "Gut gemacht. Mach weiter, wie du magst, oder drücke Ende und beginne die erste Übung",
+  "Well done. Needle drivers turn their wrist too, with Shift. Go on as you like, or press Stop and begin with the first exercise": "Gut gemacht. Nadelhalter drehen mit Umschalt auch ihr Handgelenk. Mach weiter, wie du magst, oder drücke Ende und beginne die erste Übung",
   "drag, or the arrow keys": "ziehen, oder die Pfeiltasten", "the wheel, two fingers, or Q": "Rad, zwei Finger oder Q", "the wheel, two fingers, or E": "Rad, zwei Finger oder E",
   "Shift and drag, or Z and X": "Umschalt und ziehen, oder Z und X", "Step {0} of {1}": "Schritt {0} von {1}",
   // The card.

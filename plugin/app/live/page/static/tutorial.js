@@ -24,7 +24,7 @@ export class Tutorial {
 
   // Takes how the tip is now; returns what to do, and how much of it is done.
   look(head, {mat}) {
-    if (this.at === STEPS.length) return [t("Well done. Go on as you like, or press Stop and begin with the first exercise"), 1];
+    if (this.at === STEPS.length) return [t("Well done. Needle drivers turn their wrist too, with Shift. Go on as you like, or press Stop and begin with the first exercise"), 1];
     this.from ??= {head, since: performance.now()};
     const {head: first, since} = this.from, step = ["x", "y", "z"].map(axis => head[`tip_${axis}`] - first[`tip_${axis}`]);
     const way = [0, 1, 2].map(j => mat[j] * step[0] + mat[3 + j] * step[1] + mat[6 + j] * step[2]);
