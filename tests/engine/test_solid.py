@@ -2,7 +2,6 @@
 
 import mujoco
 import numpy as np
-import palpate
 import pytest
 
 WEIGHT = 0.05 * 9.81
@@ -122,18 +121,8 @@ def test_a_step_adds_less_to_the_damping_of_a_solid_than_it_would_by_itself(scen
 def test_a_saved_state_goes_on_to_the_bit(scenes, window):
   model, data, organ = scenes.load(_resting(scenes, window))
   scenes.run(model, data, 60)
-  kind = mujoco.mjtState.mjSTATE_INTEGRATION
-  state = np.zeros(mujoco.mj_stateSize(model, kind))
-  mujoco.mj_getState(model, data, state, kind)
-  copied = mujoco.MjData(model)
-  mujoco.mj_copyData(copied, model, data)
-  scenes.run(model, data, 40)
+  scenes.goes_on(model, data, lambda each: scenes.run(model, each, 40, record=True))
   expected = organ.xpos
-  other = mujoco.MjData(model)
-  mujoco.mj_setState(model, other, state, kind)
-  for again in (other, copied):
-    scenes.run(model, again, 40)
-    np.testing.assert_array_equal(palpate.Organ(model, again, "organ").xpos, expected)
   mujoco.mj_resetData(model, data)
   scenes.run(model, data, 100)
   np.testing.assert_array_equal(organ.xpos, expected)

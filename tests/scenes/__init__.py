@@ -26,6 +26,7 @@ from .running import (
   beside,
   drive,
   follow,
+  goes_on,
   grasp,
   load,
   motion,
@@ -38,8 +39,8 @@ from .surfaces import RADIUS, sphere, strip, triangular
 
 __all__ = [
   "RADIUS", "Warnings", "adrift", "ball", "beside", "bodies", "box", "contacts", "dofs", "drive",
-  "flex", "follow", "force", "get", "grasp", "kernels", "load", "lump", "masses", "motion",
-  "organ", "plugin", "press", "probed", "put", "qposs", "resting", "ridge", "run",
+  "flex", "follow", "force", "get", "goes_on", "grasp", "kernels", "load", "lump", "masses",
+  "motion", "organ", "plugin", "press", "probed", "put", "qposs", "resting", "ridge", "run",
   "servo", "settle", "slot_bodies", "slots", "sphere", "state", "step", "strip", "triangular",
   "watch", "windowed", "workspace", "world",
 ]  # fmt: skip

@@ -1,5 +1,7 @@
 """Loads scenes and moves what is in them."""
 
+import copy
+
 import mujoco
 import numpy as np
 import palpate
@@ -134,3 +136,23 @@ def state(model, data, kind=mujoco.mjtState.mjSTATE_INTEGRATION):
   out = np.zeros(mujoco.mj_stateSize(model, kind))
   mujoco.mj_getState(model, data, out, kind)
   return out
+
+
+def goes_on(model, data, drive, fresh=True):
+  """Asserts that a motion goes on to the bit in a copy, and where its state is set; returns it.
+
+  Args:
+    model: of the data
+    data: whose motion it is; it is driven, and again after a reset
+    drive: takes a data, moves it and returns what it saw, an array
+    fresh: whether the state is set in a data as well that knows nothing of this one
+  """
+  kept, others = state(model, data), [copy.copy(data)]
+  expected = drive(data)
+  mujoco.mj_resetData(model, data)
+  for each in [data, mujoco.MjData(model)][: 1 + fresh]:
+    mujoco.mj_setState(model, each, kept, mujoco.mjtState.mjSTATE_INTEGRATION)
+    others.append(each)
+  for each in others:
+    np.testing.assert_array_equal(drive(each), expected)
+  return expected

@@ -113,17 +113,8 @@ def test_a_light_organ_is_not_heavier_for_its_window(device):
 def test_a_saved_state_goes_on_to_the_bit(coupling, device):
   m, d, organ = load(coupling, device)
   scenes.drive(m, d, 25)
-  kind = mujoco.mjtState.mjSTATE_INTEGRATION
-  saved = np.zeros(mujoco.mj_stateSize(m, kind))
   organ.sync()
-  mujoco.mj_getState(m, d, saved, kind)
-  expected = scenes.drive(m, d, 20), organ.xpos
-  mujoco.mj_resetData(m, d)
-  mujoco.mj_setState(m, d, saved, kind)
-  found = scenes.drive(m, d, 20), organ.xpos
-  assert np.abs(expected[0]).max() > 0.1
-  for a, b in zip(found, expected, strict=True):
-    np.testing.assert_array_equal(a, b)
+  assert np.abs(scenes.goes_on(m, d, lambda each: scenes.drive(m, each, 20))).max() > 0.1
 
 
 @pytest.mark.parametrize("solver", ["PGS", "CG", "Newton"])

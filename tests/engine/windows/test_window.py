@@ -1,6 +1,5 @@
 """Window coupling: the same motion as nodal coupling, and what may go wrong."""
 
-import copy
 import os
 import subprocess
 import sys
@@ -10,7 +9,7 @@ import numpy as np
 import palpate
 import pytest
 from palpate.engine import coupling, layout
-from scenes import RADIUS, drive, load, lump, organ, probed, sphere, windowed, world
+from scenes import RADIUS, drive, goes_on, load, lump, organ, probed, sphere, windowed, world
 
 
 # With friction the tip sticks on the facets and jumps off them from 0.18 s on, in a 20 us reference
@@ -47,18 +46,10 @@ def test_static_force_does_not_depend_on_the_step():
   np.testing.assert_allclose(forces, forces[0], rtol=1e-3)
 
 
-def test_state_restores_to_the_bit():
-  m = mujoco.MjModel.from_xml_string(probed())
-  d = mujoco.MjData(m)
+def test_a_state_and_a_copy_go_on_to_the_bit():
+  m, d, _ = load(probed())
   drive(m, d, 150)
-  kind = mujoco.mjtState.mjSTATE_INTEGRATION
-  state = np.empty(mujoco.mj_stateSize(m, kind))
-  mujoco.mj_getState(m, d, state, kind)
-  expected = drive(m, d, 100)
-  mujoco.mj_resetData(m, d)
-  drive(m, d, 20)
-  mujoco.mj_setState(m, d, state, kind)
-  np.testing.assert_array_equal(drive(m, d, 100), expected)
+  goes_on(m, d, lambda each: drive(m, each, 100))
 
 
 def test_reset_starts_over():
@@ -82,15 +73,6 @@ def test_two_data_of_one_model_take_turns():
   np.testing.assert_allclose(np.concatenate(forces), alone, atol=1e-9)
 
 
-def test_copied_data_continues_alike():
-  m = mujoco.MjModel.from_xml_string(probed())
-  d = mujoco.MjData(m)
-  drive(m, d, 150)
-  other = copy.copy(d)
-  ahead = drive(m, d, 50)
-  np.testing.assert_array_equal(drive(m, other, 50), ahead)
-
-
 def test_memory_need_not_be_clear_before():
   code = """if True:
     import importlib.util, pathlib, sys
@@ -98,7 +80,7 @@ def test_memory_need_not_be_clear_before():
     spec = importlib.util.spec_from_file_location("test_window", sys.argv[1])
     tests = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tests)
-    tests.test_copied_data_continues_alike()
+    tests.test_a_state_and_a_copy_go_on_to_the_bit()
     tests.test_two_data_of_one_model_take_turns()"""
   # glibc fills what it hands out with this byte's complement: slots of about 2e5.
   env = {**os.environ, "MALLOC_PERTURB_": str(0xFF ^ 0x41)}
