@@ -10,6 +10,7 @@ import numpy as np
 from palpate import Organ, Thread
 from palpate.models import laparoscope
 from palpate.tissue.config import Config
+from palpate.tissue.geometry import mesh as topology
 from scipy.spatial import cKDTree
 
 from ..learn.portable import Portable
@@ -77,7 +78,7 @@ class Physics(Instrument, Portable):
     self.target_sites = [model.site(f"target{i}").id for i in range(targets)]
     model.site_sameframe[self.target_sites] = 0  # else a site at its body's origin stays there
     self._xpos0 = self.organ.xpos0
-    self.coarse = _spread(self._xpos0, COARSE)
+    self.coarse = topology.spread(self._xpos0, COARSE)
     self._coarse0 = self._xpos0[self.coarse]
     self._stretch: tuple[np.ndarray, np.ndarray, Stretch] | None = None
     self._cuts = bool(self.organ.config.cutters)
@@ -389,12 +390,3 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
   """Returns the cross products of rows  (n, 3); a third of the time of numpy's."""
   (x1, y1, z1), (x2, y2, z2) = a.T, b.T
   return np.stack([y1 * z2 - z1 * y2, z1 * x2 - x1 * z2, x1 * y2 - y1 * x2], axis=1)
-
-
-def _spread(points: np.ndarray, count: int) -> np.ndarray:
-  """Returns indices of points far from each other, each farthest from those before."""
-  chosen, distance2 = [0], np.full(len(points), np.inf)
-  while len(chosen) < min(count, len(points)):
-    distance2 = np.minimum(distance2, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
-    chosen.append(int(np.argmax(distance2)))
-  return np.array(chosen)

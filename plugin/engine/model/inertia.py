@@ -56,7 +56,7 @@ def stiffness(
   Returns:
     whether it is; most times its inertia in `nodal` that a pressed node may have [-]
   """
-  sample = _spread(organ.mesh.rest, _outer(organ.mesh, organ.free), _FEW)
+  sample = _spread(organ.mesh, organ.free, _FEW)
   alone = _by_itself(m, organ, body, config, sample)
   stiff = len(organ.mesh.tet) or np.quantile(alone / masses(m, organ)[sample], 0.75) > _STIFF
   return bool(stiff), _PRESSED * max(1.0, float(np.median(alone / nodal[sample])))
@@ -203,7 +203,7 @@ def effective_inertia(
     gain: factor of K in A [s^2]
   """
   area = topology.vertex_areas(mesh.rest, mesh.elem)
-  sample = _spread(mesh.rest, _outer(mesh, free), _SAMPLES)
+  sample = _spread(mesh, free, _SAMPLES)
   response = _responses(body, mesh, mass, free, h, radius, gain, sample)
   # Per area, so that finer parts of the surface get less.
   specific = 1 / response / area[sample]
@@ -260,16 +260,7 @@ def _responses(
   return response
 
 
-def _outer(mesh: Mesh, free: np.ndarray) -> np.ndarray:
-  """Returns the nodes of the surface that move."""
-  return np.flatnonzero(free[: mesh.nouter])
-
-
-def _spread(rest: np.ndarray, candidates: np.ndarray, count: int) -> np.ndarray:
-  """Returns up to `count` of the candidates, each farthest from those before (Gonzalez 1985)."""
-  chosen = [int(candidates[0])]
-  distance2 = ((rest[candidates] - rest[chosen[0]]) ** 2).sum(axis=1)
-  while len(chosen) < min(count, len(candidates)):
-    chosen.append(int(candidates[np.argmax(distance2)]))
-    distance2 = np.minimum(distance2, ((rest[candidates] - rest[chosen[-1]]) ** 2).sum(axis=1))
-  return np.array(chosen)
+def _spread(mesh: Mesh, free: np.ndarray, count: int) -> np.ndarray:
+  """Returns up to `count` nodes of the surface that move, spread over it."""
+  outer = np.flatnonzero(free[: mesh.nouter])
+  return outer[topology.spread(mesh.rest[outer], count)]

@@ -154,6 +154,15 @@ def lengths(vector: np.ndarray) -> np.ndarray:
   return np.sqrt(np.einsum("...i,...i->...", vector, vector))
 
 
+def spread(points: np.ndarray, count: int) -> np.ndarray:
+  """Returns up to `count` of the points, each farthest from those before (Gonzalez 1985)."""
+  chosen, distance2 = [0], ((points - points[0]) ** 2).sum(axis=1)
+  while len(chosen) < min(count, len(points)):
+    chosen.append(int(distance2.argmax()))
+    distance2 = np.minimum(distance2, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+  return np.array(chosen)
+
+
 def area_vectors(position: np.ndarray, elem: np.ndarray) -> np.ndarray:
   """Returns the normal of each triangle times its area [m^2], (nelem, 3)."""
   a, b, c = (position[elem[:, k]] for k in range(3))
