@@ -80,17 +80,18 @@ struct Joined {
   // Adds what row `r` holds it by, where that bore in the last step or does always; returns whether it did.
   PALPATE bool hold(int r, bool always) {
     const auto row = host.row(r);
-    double J[MOST_DOFS] = {}, gives = 1.0 / host.stiffness(r), residual = -host.reference(r);
+    double J[MOST_DOFS] = {}, gives = 0.0, goes = 0.0;
     bool here = false;
     for (int k = 0; k < row.count; ++k) {
       const int d = row.dof ? row.dof[k] : k, own = find(d);
       if (row.value[k] == 0.0) continue;
       if (host.own_dof(d) >= 0) return false;
-      residual += row.value[k] * host.last_acceleration(d);
+      goes += row.value[k] * host.last_acceleration(d);
       if (own >= 0) J[own] = row.value[k], here = true;
       else gives += row.value[k] * row.value[k] / inertia(d);
     }
-    if (!here || !(always || residual < 0.0)) return false;
+    if (!here || !(always || goes < host.reference(r))) return false;
+    gives += 1.0 / host.stiffness(r);
     for (int a = 0; a < count; ++a)
       for (int b = 0; b <= a; ++b) L[a][b] += J[a] * J[b] / gives;
     return true;
