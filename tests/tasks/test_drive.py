@@ -4,11 +4,21 @@ import numpy as np
 import pytest
 from palpate.tasks import suite
 from palpate.tasks.core import episode, performer
+from palpate.tasks.domains.suturing import needles
 from palpate.tasks.recording import Recording
 
 
 def load(task="drive_easy", **kwargs):
   return suite.load("suture", task, task_kwargs={"random": 0, **kwargs})
+
+
+def test_a_needle_turns_through_marks_that_are_not_level():
+  ends = np.array([[0.001, 0.002, 0.003], [0.008, -0.001, 0.001]])
+  half = needles.half_angle(ends)
+  for angle, mark in zip((-half, half), ends, strict=True):
+    pos, mat = needles.piercing(ends, angle)
+    np.testing.assert_allclose(mat.T @ mat, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(pos + needles.RADIUS * mat[:, 1], mark, atol=1e-12)
 
 
 def test_the_expert_drives_it_through_both_marks_and_replays_to_the_bit(tmp_path):

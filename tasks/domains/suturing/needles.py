@@ -327,12 +327,19 @@ def half_angle(ends: np.ndarray) -> float:
   return math.asin(min(0.5 * float(np.linalg.norm(ends[1] - ends[0])) / RADIUS, 0.9))
 
 
+def facing(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the way from one of two marks (2, 3) to the other, and what is up across it  (3,)."""
+  way = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+  up = np.array([0.0, 0.0, 1.0]) - way[2] * way
+  return way, up / np.linalg.norm(up)
+
+
 def piercing(ends: np.ndarray, tip: float) -> Pose:
   """Returns the needle's pose with its circle through two marks (2, 3), by the angle of its tip.
 
   The angle is that at the middle of the circle, from straight down towards the second mark [rad].
   """
-  way, up = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0]), np.array([0.0, 0.0, 1.0])
+  way, up = facing(ends)
   axis = np.cross(way, up)  # about which it turns: down goes to `way`
   middle = 0.5 * (ends[0] + ends[1]) + RADIUS * math.cos(half_angle(ends)) * up
   angle = tip - QUARTER  # the tip is a quarter turn ahead of the middle of the arc
@@ -342,7 +349,6 @@ def piercing(ends: np.ndarray, tip: float) -> Pose:
 
 def tip_angle(physics: Any, ends: np.ndarray) -> float:
   """Returns the angle of the needle's tip, see `piercing`, from -90 to 270 degrees [rad]."""
-  way, tip = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0]), arc(physics, 1.0)
-  tip = tip - needle(physics)[0]
-  angle = math.atan2(float(tip @ way), -float(tip[2]))
+  (way, up), tip = facing(ends), arc(physics, 1.0) - needle(physics)[0]
+  angle = math.atan2(float(tip @ way), -float(tip @ up))
   return angle if angle > -QUARTER else angle + 4.0 * QUARTER
