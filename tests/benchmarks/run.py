@@ -11,7 +11,6 @@ from palpate.app.console import CommandError
 
 FOLDER = pathlib.Path(__file__).parent
 BENCHES = {
-  "attacks": "what random attacks break",
   "batch": "world-steps a second of batches, and what a world takes",
   "cut": "steps in which an organ is cut, beside steps in contact",
   "error": "run time against error, beside MuJoCo's own flex",

@@ -110,7 +110,7 @@ def test_the_list_of_benches(capsys):
   assert command() == 0
   assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(run.BENCHES)
   assert command("nothing") == 2
-  assert "no bench 'nothing', expected one of attacks, " in capsys.readouterr().err
+  assert "no bench 'nothing', expected one of batch, " in capsys.readouterr().err
 
 
 def test_benches_need_no_pytest(tmp_path, monkeypatch):
