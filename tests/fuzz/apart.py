@@ -23,8 +23,8 @@ def one(kind: str, seed: int):
     raise AssertionError(f"{kind}, seed {seed}: {error!r}; again: {again}") from error
 
 
-def sweep(kind: str, end: int, first: int = 0) -> dict[int, str]:
-  """Returns what fails of the seeds from `first` under `end`, whatever it does to its process.
+def sweep(kind: str, end: int) -> dict[int, str]:
+  """Returns what fails of the seeds under `end`, whatever it does to its process.
 
   Ends where there are more than MOST of them.
 
@@ -32,6 +32,7 @@ def sweep(kind: str, end: int, first: int = 0) -> dict[int, str]:
     how each fails, by seed
   """
   failed: dict[int, str] = {}
+  first = 0
   while first < end and len(failed) <= MOST:
     last = min(first + BLOCK, end)
     words = [sys.executable, __file__, kind, str(first), str(last)]

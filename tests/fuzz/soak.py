@@ -14,14 +14,11 @@ from palpate import tasks
 OF_TOOLS = ("has gone through its surface", "its windows have no room for")
 
 
-def act(name: tuple[str, str], seed: int, steps: int) -> list[str]:
+def act(name: tuple[str, str], seed: int, steps: int):
   """Acts at random for so many steps of the physics; all must stay finite and without warning.
 
   But for a tool that goes through the organ, or touches more of it than its window has room for:
   full-scale actions are no hand's.
-
-  Returns:
-    what was said of such tools
   """
   again = f"soak {name}, seed {seed}: python -m pytest tests/fuzz -k soak --seed {seed}"
   random = np.random.RandomState(seed)
@@ -46,7 +43,6 @@ def act(name: tuple[str, str], seed: int, steps: int) -> list[str]:
       assert not any(warning.number for warning in env.physics.data.warning), again
   finally:
     mujoco.set_mju_user_warning(None)
-  return warned
 
 
 def step_on_threads(count: int, seconds: float, shared: bool = False) -> int:
