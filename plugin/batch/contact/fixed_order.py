@@ -2,8 +2,8 @@
 
 mujoco_warp's threads ask for contacts and constraint rows, which are placed as they come, and add
 up over them by atomics. Here contacts and rows are put in an order that depends on the state alone,
-and the few sums over them are taken in it: J^T f and J^T D J of rows that are spread over all dofs,
-the latter by tiles of the matrix. Warp's own deterministic mode, which mujoco_warp has for all of
+and the few sums over them are taken in it: J^T f and J^T D J of rows that are spread over all dofs.
+Warp's own deterministic mode, which mujoco_warp has for all of
 its sums, writes down every addend of every kernel and sorts them all.
 """
 
@@ -14,7 +14,7 @@ its sums, writes down every addend of every kernel and sorts them all.
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import mujoco
@@ -34,8 +34,9 @@ _FRICTION = wp.constant(int(ConstraintType.FRICTION_DOF))
 _PAIR = wp.constant(64)  # contacts of two geoms, at most
 # Contacts of a world's geoms that are put in order; more stay as they came.
 _ROOM = wp.constant(64)
-_TILE = wp.constant(16)  # dofs and rows of a tile of the Hessian, which share out a row
-_ROWS = wp.constant(32)  # of a world that are worked on at once
+_LANES = wp.constant(16)  # threads that share a row
+_TERMS = wp.constant(16)  # of a sum of the Hessian that are added up by themselves
+_BLOCK = 256  # threads of a world
 _CONE = wp.constant(int(ConstraintState.CONE))
 _QUADRATIC = wp.constant(int(ConstraintState.QUADRATIC))
 
@@ -57,10 +58,10 @@ class Pairs:
   number: ints("naconmax")  # among those of two geoms
   worldid: ints("naconmax")
   moved: Array(Column, ("ncolumn",))  # what moves
-  count: ints("nworld")  # contacts of a world
-  before: ints("nworld")  # those of the worlds before it
+  count: ints("nworld")  # contacts of a world, 0 between steps
   listed: ints("nworld", _ROOM)  # as they came
-  place: ints("naconmax")  # where one goes among those of its world
+  place: ints("nworld", _ROOM)  # of the world's contacts, in ascending order
+  to: ints("nworld", _ROOM)  # where a listed one goes
   kept: Array(Column, ("ncolumn",))  # of what is moved
 
 
@@ -84,26 +85,25 @@ class Rows:
   force: floats("nworld", "njmax")
   colind: ints("nworld", 1, "njmax_nnz")
   J: floats("nworld", 1, "njmax_nnz")
-  whole: floats("nworld", "nrow", "ncolumn")  # J, of whole tiles
-  weighed: floats("nworld", "nrow", "ncolumn")  # D J, or the curvature of a cone times J
+  whole: floats("nworld", "njmax", "nv")  # J, of all dofs
+  weighed: floats("nworld", "njmax", "nv")  # D J, or the curvature of a cone times J
 
 
-@wp.func
-def _found(p: Pairs):
-  return wp.min(p.nacon[0], p.place.shape[0])
+@wp.func_native(snippet="WP_TILE_SYNC();")
+def _wait():
+  """Waits for the threads of the block, and sees what they have written."""
+  ...
 
 
 @wp.kernel(enable_backward=False)
 def _list_contacts(p: Pairs):
   """Lists the contacts of each world."""
   c = wp.tid()
-  if c >= _found(p):
-    return
-  w = p.worldid[c]
-  k = wp.atomic_add(p.count, w, 1)
-  p.place[c] = k
-  if k < _ROOM:
-    p.listed[w, k] = c
+  if c < wp.min(p.nacon[0], p.worldid.shape[0]):
+    w = p.worldid[c]
+    k = wp.atomic_add(p.count, w, 1)
+    if k < _ROOM:
+      p.listed[w, k] = c
 
 
 @wp.func
@@ -113,42 +113,41 @@ def _pair_key(p: Pairs, c: int):
 
 
 @wp.kernel(enable_backward=False)
-def _place_contacts(p: Pairs):
-  """Finds where contacts go among those of their world: by their geoms, then by their number."""
-  w, k = wp.tid()
+def _sort_contacts(p: Pairs):
+  """Puts a world's contacts in order at their places: by their geoms, then by their number."""
+  w, lane = wp.tid()
+  lanes = wp.block_dim()
   n = wp.min(p.count[w], _ROOM)
-  if k >= n:
+  _wait()
+  if lane == 0:
+    p.count[w] = 0
+  if n <= 1:
     return
-  c = p.listed[w, k]
-  key = _pair_key(p, c)
-  to = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-  for q in range(n):
-    if _pair_key(p, p.listed[w, q]) < key:
-      to += 1
-  p.place[c] = to
-
-
-@wp.kernel(enable_backward=False)
-def _keep_contacts(p: Pairs):
-  """Keeps contacts at their places, a thread a column."""
-  c, f = wp.tid()
-  if c >= _found(p):
-    return
-  to = p.before[p.worldid[c]] + p.place[c]
-  column, kept = p.moved[f].words, p.kept[f].words
-  for k in range(column.shape[1]):
-    kept[to, k] = column[c, k]
-
-
-@wp.kernel(enable_backward=False)
-def _move_contacts(p: Pairs):
-  """Moves contacts to their places, a thread a column."""
-  c, f = wp.tid()
-  if c >= _found(p):
-    return
-  column, kept = p.moved[f].words, p.kept[f].words
-  for k in range(column.shape[1]):
-    column[c, k] = kept[c, k]
+  for k in range(lane, n, lanes):
+    c = p.listed[w, k]
+    key = _pair_key(p, c)
+    rank = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    at = int(0)  # noqa: RUF046, UP018
+    for q in range(n):
+      other = p.listed[w, q]
+      at += wp.where(other < c, 1, 0)
+      rank += wp.where(_pair_key(p, other) < key, 1, 0)
+    p.place[w, at] = c
+    p.to[w, k] = rank
+  _wait()
+  for f in range(p.moved.shape[0]):
+    kept = p.kept[f].words
+    width = kept.shape[1]
+    for q in range(lane, n * width, lanes):
+      k = q / width
+      kept[p.place[w, p.to[w, k]], q % width] = p.moved[f].words[p.listed[w, k], q % width]
+  _wait()
+  for f in range(p.moved.shape[0]):
+    moved = p.moved[f].words
+    width = moved.shape[1]
+    for q in range(lane, n * width, lanes):
+      c = p.place[w, q / width]
+      moved[c, q % width] = p.kept[f].words[c, q % width]
 
 
 @wp.func
@@ -163,67 +162,50 @@ def _row_key(r: Rows, w: int, k: int):
 
 
 @wp.kernel(enable_backward=False)
-def _keep(r: Rows):
-  """Finds where rows go, and keeps them; those of one constraint stay in their order."""
-  w, k = wp.tid()
+def _sort_rows(r: Rows):
+  """Puts a world's rows in order, and spreads them over all dofs.
+
+  Rows of one constraint stay in their order.
+  """
+  w, lane = wp.tid()
+  lanes = wp.block_dim()
   n = _count(r, w)
-  if k >= n:
-    return
-  key = _row_key(r, w, k)
-  to = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-  for q in range(n):
-    other = _row_key(r, w, q)
-    if other < key or (other == key and q < k):
-      to += 1
-  part = int(0)  # noqa: RUF046, UP018
-  if r.type[w, k] >= _CONTACT:
-    part = k - r.contact_row[r.id[w, k], 0]
-  r.part[w, to] = part
-  for f in range(r.moved.shape[0]):
-    kept = r.kept[f].words
-    kept[w, to] = r.moved[f].words[w, k]
-
-
-@wp.func
-def _padded(n: int):
-  return (n + _TILE - 1) / _TILE * _TILE
-
-
-@wp.func
-def _put(r: Rows, w: int, k: int, lane: int):
-  for f in range(lane, r.moved.shape[0], _TILE):
-    column = r.moved[f].words
-    column[w, k] = r.kept[f].words[w, k]
-  if lane == 0:
+  nv = r.whole.shape[2]
+  for k in range(lane, n, lanes):
+    key = _row_key(r, w, k)
+    to = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    for q in range(n):
+      other = _row_key(r, w, q)
+      if other < key or (other == key and q < k):
+        to += 1
+    part = int(0)  # noqa: RUF046, UP018
+    if r.type[w, k] >= _CONTACT:
+      part = k - r.contact_row[r.id[w, k], 0]
+    r.part[w, to] = part
+    for f in range(r.moved.shape[0]):
+      kept = r.kept[f].words
+      kept[w, to] = r.moved[f].words[w, k]
+  for q in range(lane, n * nv, lanes):
+    r.whole[w, q / nv, q % nv] = 0.0
+  _wait()
+  for k in range(lane, n, lanes):
+    for f in range(r.moved.shape[0]):
+      column = r.moved[f].words
+      column[w, k] = r.kept[f].words[w, k]
     kind, number = r.kept[_TYPE].words[w, k], r.kept[_ID].words[w, k]
     if kind >= _CONTACT:
       r.contact_row[number, r.part[w, k]] = k
     elif kind == _FRICTION:
       r.frictionadr[w, number] = k
-  start = r.kept[_ROWADR].words[w, k]
-  for q in range(start, start + r.kept[_ROWNNZ].words[w, k]):
-    i = r.colind[w, 0, q]
-    if i % _TILE == lane:
-      r.whole[w, k, i] = r.J[w, 0, q]
-
-
-@wp.kernel(enable_backward=False)
-def _move(r: Rows):
-  """Moves rows to their places, and spreads them over all dofs, of which a thread has every 16th.
-
-  Beyond the last row the last tile is zero.
-  """
-  w, first, lane = wp.tid()
-  n = _count(r, w)
-  for k in range(first, _padded(n), _ROWS):
-    for i in range(lane, r.whole.shape[2], _TILE):
-      r.whole[w, k, i] = 0.0
-    if k < n:
-      _put(r, w, k, lane)
+    start = r.kept[_ROWADR].words[w, k]
+    for q in range(start, start + r.kept[_ROWNNZ].words[w, k]):
+      r.whole[w, k, r.colind[w, 0, q]] = r.J[w, 0, q]
 
 
 @wp.func
-def _bend(r: Rows, Jaref: wp.array2d[float], w: int, n: int, k: int, lane: int):
+def _bend(
+  r: Rows, Jaref: wp.array2d[float], w: int, n: int, k: int, lane: int, lanes: int
+):  # fmt: skip
   """Weighs a row of a contact whose force is on its cone, by mujoco_warp's curvature of that."""
   head = k - r.part[w, k]
   friction = r.friction[r.id[w, k]]
@@ -241,7 +223,7 @@ def _bend(r: Rows, Jaref: wp.array2d[float], w: int, n: int, k: int, lane: int):
   own = mu
   if k > head:
     own = friction[k - head - 1]
-  for i in range(lane, r.whole.shape[2], _TILE):
+  for i in range(lane, r.whole.shape[2], lanes):
     normal = mu * r.whole[w, head, i]
     along = float(0.0)  # noqa: UP018
     for d in range(1, dim):
@@ -254,73 +236,70 @@ def _bend(r: Rows, Jaref: wp.array2d[float], w: int, n: int, k: int, lane: int):
     r.weighed[w, k, i] = scale * own * value
 
 
-@wp.kernel(enable_backward=False)
-def _weigh(r: Rows, Jaref: wp.array2d[float], done: wp.array[bool]):
-  """Finds the rows W of J^T W, the constraints' part of the Hessian.
+@wp.func
+def _weigh(r: Rows, Jaref: wp.array2d[float], w: int, n: int, k: int, lane: int, lanes: int):
+  """Finds a row of W in J^T W, the constraints' part of the Hessian.
 
   It is D J where the cost is quadratic. On a contact's cone it is C J, with the curvature C of the
   contact's rows; those of a dof's friction have been added to the Hessian's diagonal.
   """
-  w, first, lane = wp.tid()
-  if done[w]:
-    return
-  n = _count(r, w)
-  for k in range(first, _padded(n), _ROWS):
-    weight = float(0.0)  # noqa: UP018 - a variable to Warp
-    bent = bool(False)  # noqa: UP018
-    if k < n:
-      bent = r.state[w, k - r.part[w, k]] == _CONE
-      if r.state[w, k] == _QUADRATIC and r.type[w, k] != _FRICTION:
-        weight = r.D[w, k]
-    if bent:
-      _bend(r, Jaref, w, n, k, lane)
-    else:
-      for i in range(lane, r.whole.shape[2], _TILE):
-        r.weighed[w, k, i] = weight * r.whole[w, k, i]
+  weight = float(0.0)  # noqa: UP018 - a variable to Warp
+  if r.state[w, k] == _QUADRATIC and r.type[w, k] != _FRICTION:
+    weight = r.D[w, k]
+  if r.state[w, k - r.part[w, k]] == _CONE:
+    _bend(r, Jaref, w, n, k, lane, lanes)
+  else:
+    for i in range(lane, r.whole.shape[2], lanes):
+      r.weighed[w, k, i] = weight * r.whole[w, k, i]
 
 
-@wp.kernel(module="unique", enable_backward=False, module_options={"enable_mathdx_gemm": False})
-def _add_hessian(r: Rows, done: wp.array[bool], h: wp.array3d[float]):
-  """Adds J^T W to the upper triangle of the Hessian, a block a tile."""
-  w, tile, _lane = wp.tid()
-  if done[w]:
-    return
-  j = int((wp.sqrt(float(8 * tile + 1)) - 1.0) * 0.5)
-  i = (tile - j * (j + 1) // 2) * _TILE
-  j = j * _TILE
-  total = wp.tile_load(h[w], shape=(_TILE, _TILE), offset=(i, j), storage="shared")
-  for k in range(0, _count(r, w), _TILE):
-    a = wp.tile_load(r.whole[w], shape=(_TILE, _TILE), offset=(k, i))
-    b = wp.tile_load(r.weighed[w], shape=(_TILE, _TILE), offset=(k, j))
-    wp.tile_matmul(wp.tile_transpose(a), b, total)
-  wp.tile_store(h[w], total, offset=(i, j))
-
-
-@wp.kernel(module="unique", enable_backward=False)
+@wp.kernel(enable_backward=False)
 def _gradient(
-  r: Rows, smooth: wp.array2d[float], Ma: wp.array2d[float], done: wp.array[bool],
-  qfrc: wp.array2d[float], grad: wp.array2d[float], square: wp.array[float],
+  r: Rows, Jaref: wp.array2d[float], smooth: wp.array2d[float], Ma: wp.array2d[float],
+  done: wp.array[bool], qfrc: wp.array2d[float], grad: wp.array2d[float], square: wp.array[float],
   decrement: wp.array[float], scale: wp.array[float], unchanged: wp.array[bool],
 ):  # fmt: skip
-  """Finds J^T f and the gradient, a block a world, and its square."""
-  w, lane = wp.tid()
+  """Finds J^T f, the gradient and its square, and W, a block a world."""
+  w, thread = wp.tid()
   unchanged[w] = False
   if done[w]:
     return
+  n = _count(r, w)
+  lanes = wp.min(_LANES, wp.block_dim())
+  for k in range(thread / lanes, n, wp.block_dim() / lanes):
+    _weigh(r, Jaref, w, n, k, thread % lanes, lanes)
   mine = float(0.0)  # noqa: UP018 - a variable to Warp
-  for i in range(lane, Ma.shape[1], wp.block_dim()):
+  for i in range(thread, r.whole.shape[2], wp.block_dim()):
     total = float(0.0)  # noqa: UP018
-    for k in range(_count(r, w)):
+    for k in range(n):
       total += r.whole[w, k, i] * r.force[w, k]
     g = Ma[w, i] - smooth[w, i] - total
     qfrc[w, i] = total
     grad[w, i] = g
     mine += g * g
   whole = wp.tile_reduce(wp.add, wp.tile(mine, preserve_type=True))
-  if lane == 0:
+  if thread == 0:
     square[w] = whole[0]
     decrement[w] = 0.0
     scale[w] = 1.0
+
+
+@wp.kernel(enable_backward=False)
+def _add_hessian(r: Rows, done: wp.array[bool], h: wp.array3d[float]):
+  """Adds J^T W to the upper triangle of the Hessian, a thread an entry."""
+  w, entry = wp.tid()
+  n = _count(r, w)
+  if done[w] or n == 0:
+    return
+  j = int((wp.sqrt(float(8 * entry + 1)) - 1.0) * 0.5)
+  i = entry - j * (j + 1) // 2
+  total = h[w, i, j]
+  for first in range(0, n, _TERMS):
+    terms = float(0.0)  # noqa: UP018 - a variable to Warp
+    for k in range(first, wp.min(first + _TERMS, n)):
+      terms += r.whole[w, k, i] * r.weighed[w, k, j]
+    total += terms
+  h[w, i, j] = total
 
 
 # In place of kernels of mujoco_warp's, with their arguments.
@@ -353,15 +332,16 @@ def _compensation(deterministic: bool) -> wp.Kernel:
   return compensation
 
 
+@wp.func
+def _in_order(a: int, b: int, of_a: float, of_b: float):
+  if of_a != of_b:
+    return of_a < of_b
+  return wp.max(a, ~a) < wp.max(b, ~b)  # ~ where the sensor's body is the second
+
+
 @functools.cache
 def sort_matches(most: int) -> wp.Kernel:
   """Returns the kernel that orders a sensor's contacts: by its criterion, then by their places."""
-
-  @wp.func
-  def before(a: int, b: int, of_a: float, of_b: float):
-    if of_a != of_b:
-      return of_a < of_b
-    return wp.max(a, ~a) < wp.max(b, ~b)  # ~ where the sensor's body is the second
 
   @wp.kernel(module="unique", enable_backward=False)
   def sort_matches(
@@ -369,19 +349,17 @@ def sort_matches(most: int) -> wp.Kernel:
     match: wp.array3d[int], criterion: wp.array3d[float], out: wp.array3d[int],
   ):  # fmt: skip
     w, s, lane = wp.tid()
-    if lane > 0:
-      return
-    for k in range(1, wp.min(count[w, s], wp.static(most))):
-      at = k
-      mine = match[w, s, k]  # a copy: of two at once Warp keeps where they are
-      own = criterion[w, s, k]
-      while at > 0 and before(mine, match[w, s, wp.max(at - 1, 0)],
-                              own, criterion[w, s, wp.max(at - 1, 0)]):  # fmt: skip
-        match[w, s, at] = match[w, s, at - 1]
-        criterion[w, s, at] = criterion[w, s, at - 1]
-        at -= 1
-      match[w, s, at] = mine
-      criterion[w, s, at] = own
+    n = wp.min(count[w, s], wp.static(most))
+    for turn in range(n):  # of neighbours, those that begin at even places and those at odd ones
+      for k in range(turn % 2 + 2 * lane, n - 1, 2 * wp.block_dim()):
+        a = match[w, s, k]  # a copy: of two at once Warp keeps where they are
+        of_a = criterion[w, s, k]
+        if _in_order(match[w, s, k + 1], a, criterion[w, s, k + 1], of_a):
+          match[w, s, k] = match[w, s, k + 1]
+          match[w, s, k + 1] = a
+          criterion[w, s, k] = criterion[w, s, k + 1]
+          criterion[w, s, k + 1] = of_a
+      _wait()
 
   return sort_matches
 
@@ -450,14 +428,9 @@ class FixedOrder:
       colind=efc.J_colind,
       J=efc.J,
     )
-    tiles = m.nv_pad // _TILE
-    self._tiles = tiles * (tiles + 1) // 2
-    padded = -(-d.njmax // _TILE) * _TILE
-    values |= {name: np.zeros((d.nworld, padded, m.nv_pad)) for name in ("whole", "weighed")}
-    self._spread = d.nworld, _ROWS, _TILE
+    values |= {name: np.zeros((*shape, m.nv)) for name in ("whole", "weighed")}
     values |= self._room_for([getattr(efc, name) for name in _COLUMNS])
     self._rows = fill(Rows, device, values)
-    self._shape = shape
     each = [getattr(contact, name.name) for name in dataclasses.fields(contact)]
     columns = self._room_for([array for array in each if array.shape == contact.dist.shape])
     self._pairs = fill(Pairs, device, dict(
@@ -468,9 +441,7 @@ class FixedOrder:
       worldid=contact.worldid,
       **columns,
       count=np.zeros(d.nworld),
-      before=np.zeros(d.nworld),
-      listed=np.zeros((d.nworld, _ROOM)),
-      place=np.zeros(d.naconmax),
+      **{name: np.zeros((d.nworld, _ROOM)) for name in ("listed", "place", "to")},
     ))  # fmt: skip
 
   def _room_for(self, arrays: list[wp.array]) -> dict[str, wp.array]:
@@ -482,19 +453,20 @@ class FixedOrder:
 
   def sort_contacts(self) -> None:
     """Launches what puts contacts in order, once those of geoms are found and before others are."""
-    p, device = self._pairs, self._pairs.nacon.device
-    p.count.zero_()
-    wp.launch(_list_contacts, dim=p.place.shape, inputs=[p], device=device)
-    wp.launch(_place_contacts, dim=p.listed.shape, inputs=[p], device=device)
-    wp.utils.array_scan(p.count, p.before, inclusive=False)
-    for kernel in (_keep_contacts, _move_contacts):
-      wp.launch(kernel, dim=(p.place.size, p.moved.size), inputs=[p], device=device)
+    p = self._pairs
+    wp.launch(_list_contacts, dim=p.worldid.shape, inputs=[p], device=p.nacon.device)
+    self._launch(_sort_contacts, [p])
 
   def sort(self) -> None:
     """Launches what puts the rows in order, once they are made and before they are used."""
-    rows, device = [self._rows], self._rows.nefc.device
-    wp.launch(_keep, dim=self._shape, inputs=rows, device=device)
-    wp.launch(_move, dim=self._spread, inputs=rows, device=device)
+    self._launch(_sort_rows, [self._rows])
+
+  def _launch(self, kernel: wp.Kernel, inputs: list, outputs: Sequence[wp.array] = ()) -> None:
+    """Launches a kernel, a block a world."""
+    count = self._rows.nefc
+    wp.launch_tiled(
+      kernel, dim=count.shape, inputs=inputs, outputs=outputs, device=count.device, block_dim=_BLOCK
+    )
 
   def _update_constraint(self, m, d, ctx, track_changes=False, stable_fast=False) -> None:
     """Launches what finds forces of rows, in place of mujoco_warp's; J^T f is the gradient's."""
@@ -513,13 +485,11 @@ class FixedOrder:
 
   def _update_gradient(self, m, d, ctx, compact=False) -> None:
     """Launches what finds the gradient, the Hessian and the search, in place of mujoco_warp's."""
-    wp.launch_tiled(
+    self._launch(
       _gradient,
-      dim=d.nworld,
-      inputs=[self._rows, d.qfrc_smooth, d.efc.Ma, ctx.done],
-      outputs=[d.qfrc_constraint, ctx.grad, ctx.grad_dot, ctx.newton_decrement, ctx.grad_scale,
-               ctx.search_unchanged],
-      block_dim=128,
+      [self._rows, ctx.Jaref, d.qfrc_smooth, d.efc.Ma, ctx.done],
+      [d.qfrc_constraint, ctx.grad, ctx.grad_dot, ctx.newton_decrement, ctx.grad_scale,
+       ctx.search_unchanged],
     )  # fmt: skip
     solver = private.solver
     wp.launch(
@@ -529,10 +499,8 @@ class FixedOrder:
               ctx.done],
       outputs=[ctx.h],
     )  # fmt: skip
-    wp.launch(_weigh, dim=self._spread, inputs=[self._rows, ctx.Jaref, ctx.done])
-    wp.launch_tiled(
-      _add_hessian, dim=(d.nworld, self._tiles), inputs=[self._rows, ctx.done, ctx.h], block_dim=64
-    )
+    entries = m.nv * (m.nv + 1) // 2
+    wp.launch(_add_hessian, dim=(d.nworld, entries), inputs=[self._rows, ctx.done, ctx.h])
     solver._cholesky_factorize_solve(m, d, ctx)
 
   @contextlib.contextmanager
