@@ -9,6 +9,7 @@ from mujoco_warp._src.collision_primitive_core import (
   sphere_triangle,
 )
 from mujoco_warp._src.constraint import _contact_kbimp as contact_kbimp
+from mujoco_warp._src.ray import ray_geom
 from mujoco_warp._src.support import jac_dof
 from mujoco_warp._src.types import (
   MJ_MAX_EPAFACES,
@@ -25,5 +26,5 @@ from mujoco_warp._src.types import (
 __all__ = [
   "MJ_MAX_EPAFACES", "MJ_MAX_EPAHORIZON", "ConstraintState", "ConstraintType", "ContactType",
   "DeterminismType", "Geom", "GeomType", "OverflowType", "box_triangle", "capsule_triangle", "ccd",
-  "contact_kbimp", "jac_dof", "passive", "sensor", "solver", "sphere_triangle", "vec5",
+  "contact_kbimp", "jac_dof", "passive", "ray_geom", "sensor", "solver", "sphere_triangle", "vec5",
 ]  # fmt: skip

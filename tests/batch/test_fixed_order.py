@@ -157,6 +157,26 @@ def test_gradient_and_hessian_are_those_of_mujoco_warp():
     np.testing.assert_allclose(*values, rtol=1e-5, atol=1e-8)  # digits of float32
 
 
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_touch_sensors_feel_what_those_of_mujoco_warp_do(cone):
+  felt = []
+  for deterministic in (False, True):
+    spec = mujoco.MjSpec.from_string(probed(cone=cone))
+    for size in (0.02, 1e-6):  # the second one sees no contact
+      spec.body("tool").add_site(name=f"skin {size}", size=[size, 0, 0])
+      spec.add_sensor(
+        name=f"{size}", type=mujoco.mjtSensor.mjSENS_TOUCH, objname=f"skin {size}",
+        objtype=mujoco.mjtObj.mjOBJ_SITE,
+      )  # fmt: skip
+    batch = palpate.batch.make(spec, 2, "warp-cpu", deterministic=deterministic)
+    for k in range(30):
+      batch.ctrl = np.array([[-0.0002 * k, 0.0001 * k], [0.0, 0.0]])
+      batch.step()
+    felt.append(batch.sensordata.numpy())
+  np.testing.assert_allclose(*felt, rtol=1e-3)
+  assert felt[1][0, 0] > 0.01 and felt[1].ravel()[1:].max() == 0.0
+
+
 def test_what_is_not_known_is_left_to_warp():
   batch = palpate.batch.make(mujoco.MjSpec.from_string(probed()), 1, "warp-cpu", deterministic=True)
   assert is_enough(batch.m, batch.bare)

@@ -89,6 +89,26 @@ class Rows:
   weighed: floats("nworld", "njmax", "nv")  # D J, or the curvature of a cone times J
 
 
+@struct
+class Touches:
+  """The touch sensors, and the contacts that they feel."""
+
+  pyramids: int  # whether a contact's force is the sum of its rows
+  sensor: ints("ntouch")
+  site: ints("nsensor")
+  adr: ints("nsensor")
+  site_type: ints("nsite")
+  site_body: ints("nsite")
+  size: Array(wp.vec3, ("nsite",))
+  geom_body: ints("ngeom")
+  site_xpos: Array(wp.vec3, ("nworld", "nsite"))
+  site_xmat: Array(wp.mat33, ("nworld", "nsite"))
+  geom: Array(wp.vec2i, ("naconmax",))
+  pos: Array(wp.vec3, ("naconmax",))
+  frame: Array(wp.mat33, ("naconmax",))
+  out: floats("nworld", "nsensordata")
+
+
 @wp.func_native(snippet="WP_TILE_SYNC();")
 def _wait():
   """Waits for the threads of the block, and sees what they have written."""
@@ -254,22 +274,24 @@ def _weigh(r: Rows, Jaref: wp.array2d[float], w: int, n: int, k: int, lane: int,
 
 
 @wp.kernel(enable_backward=False)
-def _gradient(
+def _update(
   r: Rows, Jaref: wp.array2d[float], smooth: wp.array2d[float], Ma: wp.array2d[float],
   done: wp.array[bool], qfrc: wp.array2d[float], grad: wp.array2d[float], square: wp.array[float],
   decrement: wp.array[float], scale: wp.array[float], unchanged: wp.array[bool],
+  h: wp.array3d[float],
 ):  # fmt: skip
-  """Finds J^T f, the gradient and its square, and W, a block a world."""
+  """Finds J^T f, the gradient and its square; adds J^T W to the Hessian's upper triangle."""
   w, thread = wp.tid()
   unchanged[w] = False
   if done[w]:
     return
   n = _count(r, w)
+  nv = r.whole.shape[2]
   lanes = wp.min(_LANES, wp.block_dim())
   for k in range(thread / lanes, n, wp.block_dim() / lanes):
     _weigh(r, Jaref, w, n, k, thread % lanes, lanes)
   mine = float(0.0)  # noqa: UP018 - a variable to Warp
-  for i in range(thread, r.whole.shape[2], wp.block_dim()):
+  for i in range(thread, nv, wp.block_dim()):
     total = float(0.0)  # noqa: UP018
     for k in range(n):
       total += r.whole[w, k, i] * r.force[w, k]
@@ -282,24 +304,51 @@ def _gradient(
     square[w] = whole[0]
     decrement[w] = 0.0
     scale[w] = 1.0
+  _wait()
+  if n == 0:
+    return
+  for entry in range(thread, nv * (nv + 1) // 2, wp.block_dim()):
+    j = int((wp.sqrt(float(8 * entry + 1)) - 1.0) * 0.5)
+    i = entry - j * (j + 1) // 2
+    curve = h[w, i, j]
+    for first in range(0, n, _TERMS):
+      terms = float(0.0)  # noqa: UP018
+      for k in range(first, wp.min(first + _TERMS, n)):
+        terms += r.whole[w, k, i] * r.weighed[w, k, j]
+      curve += terms
+    h[w, i, j] = curve
 
 
 @wp.kernel(enable_backward=False)
-def _add_hessian(r: Rows, done: wp.array[bool], h: wp.array3d[float]):
-  """Adds J^T W to the upper triangle of the Hessian, a thread an entry."""
-  w, entry = wp.tid()
+def _touch(r: Rows, t: Touches):
+  """Adds up the normal forces of contacts of a touch sensor's body that its site sees."""
+  w, s = wp.tid()
+  sensor = t.sensor[s]
+  site = t.site[sensor]
+  body = t.site_body[site]
   n = _count(r, w)
-  if done[w] or n == 0:
-    return
-  j = int((wp.sqrt(float(8 * entry + 1)) - 1.0) * 0.5)
-  i = entry - j * (j + 1) // 2
-  total = h[w, i, j]
-  for first in range(0, n, _TERMS):
-    terms = float(0.0)  # noqa: UP018 - a variable to Warp
-    for k in range(first, wp.min(first + _TERMS, n)):
-      terms += r.whole[w, k, i] * r.weighed[w, k, j]
-    total += terms
-  h[w, i, j] = total
+  total = float(0.0)  # noqa: UP018 - a variable to Warp
+  for k in range(n):
+    if r.type[w, k] >= _CONTACT and r.part[w, k] == 0:
+      c = r.id[w, k]
+      geom = t.geom[c]
+      second = t.geom_body[geom[1]] == body
+      if second or t.geom_body[geom[0]] == body:
+        force = r.force[w, k]
+        q = k + 1
+        while t.pyramids != 0 and q < n and r.part[w, q] == q - k:
+          force += r.force[w, q]
+          q += 1
+        frame = t.frame[c]
+        way = wp.normalize(wp.vec3(frame[0, 0], frame[0, 1], frame[0, 2]))
+        if second:
+          way = -way
+        far, _normal = private.ray_geom(
+          t.site_xpos[w, site], t.site_xmat[w, site], t.size[site], t.pos[c], way, t.site_type[site]
+        )
+        if force > 0.0 and far >= 0.0:
+          total += force
+  t.out[w, t.adr[sensor]] = total
 
 
 # In place of kernels of mujoco_warp's, with their arguments.
@@ -411,6 +460,7 @@ class FixedOrder:
   def __init__(self, m: Any, d: Any):
     """Makes room for contacts and rows on their way."""
     efc, contact, shape = d.efc, d.contact, (d.nworld, d.njmax)
+    self._model, self._none = m, wp.empty(0, dtype=int, device=efc.type.device)
     self._kept: list[wp.array] = []
     device = efc.type.device
     values = dict(
@@ -442,6 +492,22 @@ class FixedOrder:
       **columns,
       count=np.zeros(d.nworld),
       **{name: np.zeros((d.nworld, _ROOM)) for name in ("listed", "place", "to")},
+    ))  # fmt: skip
+    self._touches = fill(Touches, device, dict(
+      pyramids=int(m.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL),
+      sensor=m.sensor_touch_adr,
+      site=m.sensor_objid,
+      adr=m.sensor_adr,
+      site_type=m.site_type,
+      site_body=m.site_bodyid,
+      size=m.site_size,
+      geom_body=m.geom_bodyid,
+      site_xpos=d.site_xpos,
+      site_xmat=d.site_xmat,
+      geom=contact.geom,
+      pos=contact.pos,
+      frame=contact.frame,
+      out=d.sensordata,
     ))  # fmt: skip
 
   def _room_for(self, arrays: list[wp.array]) -> dict[str, wp.array]:
@@ -485,12 +551,6 @@ class FixedOrder:
 
   def _update_gradient(self, m, d, ctx, compact=False) -> None:
     """Launches what finds the gradient, the Hessian and the search, in place of mujoco_warp's."""
-    self._launch(
-      _gradient,
-      [self._rows, ctx.Jaref, d.qfrc_smooth, d.efc.Ma, ctx.done],
-      [d.qfrc_constraint, ctx.grad, ctx.grad_dot, ctx.newton_decrement, ctx.grad_scale,
-       ctx.search_unchanged],
-    )  # fmt: skip
     solver = private.solver
     wp.launch(
       solver._update_gradient_init_h_sparse(False),
@@ -499,27 +559,39 @@ class FixedOrder:
               ctx.done],
       outputs=[ctx.h],
     )  # fmt: skip
-    entries = m.nv * (m.nv + 1) // 2
-    wp.launch(_add_hessian, dim=(d.nworld, entries), inputs=[self._rows, ctx.done, ctx.h])
+    self._launch(
+      _update,
+      [self._rows, ctx.Jaref, d.qfrc_smooth, d.efc.Ma, ctx.done],
+      [d.qfrc_constraint, ctx.grad, ctx.grad_dot, ctx.newton_decrement, ctx.grad_scale,
+       ctx.search_unchanged, ctx.h],
+    )  # fmt: skip
     solver._cholesky_factorize_solve(m, d, ctx)
 
   @contextlib.contextmanager
   def adding(self) -> Iterator[None]:
     """Lets what mujoco_warp launches within add up in order."""
     solver, sensor = private.solver, private.sensor
-    instead: dict[tuple[Any, str], Any] = {
-      (solver, "_use_incremental"): lambda m: False,
-      (solver, "_update_constraint"): self._update_constraint,
-      (solver, "_update_gradient"): self._update_gradient,
-      (private.passive, "_gravity_force"): _compensation,
-      (sensor, "_contact_sort"): sort_matches,
-      (sensor, "_sensor_touch"): lambda deterministic: kept[sensor, "_sensor_touch"](True),
-    }
-    kept = {(module, name): getattr(module, name) for module, name in instead}
+    evaluate = sensor.sensor_acc
+
+    def feel(m, d, *args, **kwargs):
+      dim = d.nworld, self._touches.sensor.size
+      wp.launch(_touch, dim=dim, inputs=[self._rows, self._touches])
+      evaluate(m, d, *args, **kwargs)
+
+    instead: list[tuple[Any, str, Any]] = [
+      (solver, "_use_incremental", lambda m: False),
+      (solver, "_update_constraint", self._update_constraint),
+      (solver, "_update_gradient", self._update_gradient),
+      (private.passive, "_gravity_force", _compensation),
+      (sensor, "_contact_sort", sort_matches),
+      (sensor, "sensor_acc", feel),
+      (self._model, "sensor_touch_adr", self._none),
+    ]
+    kept = [(owner, name, getattr(owner, name)) for owner, name, _ in instead]
     try:
-      for (module, name), other in instead.items():
-        setattr(module, name, other)
+      for change in instead:
+        setattr(*change)
       yield
     finally:
-      for (module, name), own in kept.items():
-        setattr(module, name, own)
+      for change in kept:
+        setattr(*change)
