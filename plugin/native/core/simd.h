@@ -9,7 +9,8 @@
 //     st(energy, s, 0.5f * ld(mass, s, lane) * dot(v, v), lane);
 //   });
 // LANES is eight; `tissue/kernels.py` prints it and the other constants before the headers. Code in
-// doubles, whose sums are taken in the order in which they stand, begins with AS_WRITTEN.
+// doubles, whose sums are taken in the order in which they stand, begins with AS_WRITTEN. Large functions
+// with several callers are CALLED: inlined on CUDA too, they would take minutes to compile.
 #pragma once
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)
@@ -20,10 +21,12 @@
 
 #if ON_CUDA
 #define PALPATE __device__ __forceinline__
+#define CALLED __device__ __noinline__
 #define INLINED
 #define AS_WRITTEN
 #else
 #define PALPATE __attribute__((always_inline)) inline
+#define CALLED PALPATE
 #define INLINED [[clang::always_inline]]  // before a call of a lambda
 #define AS_WRITTEN _Pragma("clang fp contract(off) reassociate(off)")
 // Sums of eight are not of one order anyway; products are fused with them.

@@ -82,7 +82,7 @@ PALPATE bool factorize(const Envelope& A, double* u) {
 }
 
 // A^-1 b in place of b, from the factors.
-PALPATE void solve_factorized(const Envelope& L, double* b) {
+CALLED void solve_factorized(const Envelope& L, double* b) {
   for (int i = 0; i < L.n; ++i) {
     const int lo = L.first[i];
     b[i] -= dot_of(L.row(i) + lo, b + lo, i - lo);

@@ -62,7 +62,7 @@ PALPATE void add_row(const Fields& f, int node, const double* J, double force, d
 // The cost of a cone (MuJoCo, Computation, elliptic cones) whose first row is r; adds its gradient and
 // second derivative where there are a gradient and a matrix.
 template <class Fields>
-PALPATE double cone(const Fields& f, int r, int dim, const double* x, double h, double* g, const RodMatrix* H) {
+CALLED double cone(const Fields& f, int r, int dim, const double* x, double h, double* g, const RodMatrix* H) {
   const RodRow<Fields> first{f, r};
   const double mu = first.friction(), per = 1.0 / (h * h);
   double u[6], slope[6], T2 = 0.0, cost = 0.0;
@@ -107,7 +107,7 @@ PALPATE double cone(const Fields& f, int r, int dim, const double* x, double h, 
 
 // The cost of this lane's rows; adds gradient and second derivative of all where there are a gradient and a matrix.
 template <class Fields>
-PALPATE double rows_cost(const Fields& f, const double* x, double h, double* g, const RodMatrix* H) {
+CALLED double rows_cost(const Fields& f, const double* x, double h, double* g, const RodMatrix* H) {
   double cost = 0.0;
   const int n = f.count.data[0];
   const auto add = [&](int r) {
@@ -137,7 +137,7 @@ PALPATE double rows_cost(const Fields& f, const double* x, double h, double* g, 
 
 // The cost at a state; where constraints alone cost more than `most`, only that: no other part is negative.
 template <class Fields>
-PALPATE double step_cost(const Fields& f, const double* x, const double* turn, double h, double most = ENDLESS) {
+CALLED double step_cost(const Fields& f, const double* x, const double* turn, double h, double most = ENDLESS) {
   const double rows = h * h * rows_cost(f, x, h, nullptr, nullptr), least = sum_together(rows);
   if (least > most) return least;
   double sum = 0.0;

@@ -77,7 +77,7 @@ PALPATE double twist_at(const Fields& f, const double* x, const double* turn, in
 
 // The elastic energy of this lane's nodes [J].
 template <class Fields>
-PALPATE double rod_energy(const Fields& f, const double* x, const double* turn) {
+CALLED double rod_energy(const Fields& f, const double* x, const double* turn) {
   double sum = 0.0;
   each_lane(0, f.nnode - 1, [&](int i) {
     const double longer = norm(load(x + 3 * i + 3) - load(x + 3 * i)) - f.length.data[i];

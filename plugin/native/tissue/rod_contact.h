@@ -40,7 +40,7 @@ PALPATE Nearest nearest(D3 p, D3 d, D3 q, D3 e) {
   return {s, t, r + s * d - t * e, moves_s, moves_t};
 }
 
-PALPATE Nearest nearest_edges(const double* x, int i, int j) {
+CALLED Nearest nearest_edges(const double* x, int i, int j) {
   const D3 p = load(x + 3 * i), q = load(x + 3 * j);
   return nearest(p, load(x + 3 * i + 3) - p, q, load(x + 3 * j + 3) - q);
 }
@@ -71,7 +71,7 @@ PALPATE double reach_of(const Fields& f, double h) {
 
 // Lists the pairs of edges that are near each other at x; returns whether there is room for all.
 template <class Fields>
-PALPATE bool list_near(const Fields& f, const double* x) {
+CALLED bool list_near(const Fields& f, const double* x) {
   const int n = f.nnode;
   int count = 0;
   const double far = 2.0 * f.radius + f.reach.data[0], reach = far + f.longest;
@@ -122,7 +122,7 @@ PALPATE int lowest_bit(unsigned word) { return __builtin_ctz(word); }
 // Orders the nodes so that those that have to do with each other are near: next comes, of those that a
 // node before has to do with, the one that adds the fewest (King 1970, doi:10.1002/nme.1620020406).
 template <class Fields>
-PALPATE void order_nodes(const Fields& f, const double* x) {
+CALLED void order_nodes(const Fields& f, const double* x) {
   const int n = f.nnode, words = (n + 31) / 32;
   unsigned* near = (unsigned*)f.near.data;
   const auto mark = [&](unsigned* row, int i) { row[i / 32] |= 1u << (i % 32); };
@@ -284,7 +284,7 @@ struct PairTerms {
 // The energy of this lane's contacts at x; adds the gradient and second derivative of all where there are a gradient
 // and a matrix, see `add_rod`.
 template <class Fields>
-PALPATE double contacts_energy(const Fields& f, const double* x, double h, double* g, const RodMatrix* H, bool exact) {
+CALLED double contacts_energy(const Fields& f, const double* x, double h, double* g, const RodMatrix* H, bool exact) {
   const double slow = h * f.smooth.data[0];
   double sum = 0.0;
   const auto add_pair = [&](int p, PairTerms& own) {
@@ -328,7 +328,7 @@ PALPATE double contacts_energy(const Fields& f, const double* x, double h, doubl
 // Notes the pressure of each listed pair at the start of the step, and where it acts; -1 of pairs that are
 // nearer than can be, as where a state was set so: they do not meet until they are apart.
 template <class Fields>
-PALPATE void note_pressure(const Fields& f) {
+CALLED void note_pressure(const Fields& f) {
   f.smooth.data[0] = f.slow;
   for (int p = 0; p < f.count.data[1]; ++p) {
     const Nearest at = nearest_edges(f.start.data, f.pair.data[2 * p], f.pair.data[2 * p + 1]);
@@ -398,7 +398,7 @@ PALPATE double safe_for(const Fields& f, const double* x, const double* move, in
 // How much of a move of all nodes, a distance `stride` apart in `move`, can be taken so that no edges go
 // through each other. The list must have all pairs that may meet.
 template <class Fields>
-PALPATE double safe_part(const Fields& f, const double* x, const double* move, int stride) {
+CALLED double safe_part(const Fields& f, const double* x, const double* move, int stride) {
   double part = 1.0, most = 0.0;
   each_lane(0, f.nnode, [&](int i) {
     const double far = norm(load(move + stride * i));

@@ -15,7 +15,7 @@ constexpr double DRAG = 0.02;
 // The energy of the ties, in one lane; adds its gradient and second derivative where there are a gradient and a matrix,
 // and notes the forces.
 template <class Fields>
-PALPATE double ties_energy(const Fields& f, const double* x, double* g, const RodMatrix* H) {
+CALLED double ties_energy(const Fields& f, const double* x, double* g, const RodMatrix* H) {
   double sum = 0.0;
   const auto add = [&](int t) {
     const int i = f.tie_edge.data[t], node[2] = {i, i + 1};
