@@ -8,6 +8,7 @@ answers; row k of forces is what was measured in the step that led to observatio
 import dataclasses
 import json
 import os
+import zipfile
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,6 +24,7 @@ from ..inputs import SIGNALS
 from ..recording import Recording
 
 OPEN = ("time limit", "stopped")  # outcomes of an episode that could have gone on
+LEVEL = 1  # of compression: pictures take 3 % more than at 6, in a third to two thirds of the time
 # What LeRobot calls the groups, in data sets and in environments, and the pictures.
 VECTORS = {
   "observation.state": "sensors", "observation.environment_state": "state",
@@ -74,8 +76,14 @@ class Demonstration:
     arrays = {"meta": np.array(json.dumps(meta)), "action": self.actions, "reward": self.rewards}
     arrays |= {f"observation.{name}": value for name, value in self.observations.items()}
     arrays |= {f"force.{name}": value for name, value in self.forces.items()}
-    with replacing(path, "wb") as file:
-      np.savez_compressed(file, allow_pickle=False, **arrays)
+    # `np.savez_compressed` knows no level.
+    with (
+      replacing(path, "wb") as file,
+      zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive,
+    ):
+      for name, value in arrays.items():
+        with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+          np.lib.format.write_array(entry, np.asarray(value), allow_pickle=False)
 
   @classmethod
   def load(cls, path: str | os.PathLike[str]) -> "Demonstration":

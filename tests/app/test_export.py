@@ -111,6 +111,9 @@ def test_robomimic_has_its_groups(data, episodes):
     np.testing.assert_array_equal(demo["next_obs/tip_pos"], episode.observations["tip_pos"][1:])
     np.testing.assert_array_equal(demo["forces/force"], episode.forces["force"][1:])
     assert demo["obs/pixels"].shape == (len(episode), 32, 48, 3) and demo["obs/pixels"][0].any()
+    pixels = episode.observations["pixels"]
+    np.testing.assert_array_equal(demo["obs/pixels"], pixels[:-1])
+    np.testing.assert_array_equal(demo["next_obs/pixels"], pixels[1:])
     assert demo["dones"][:].tolist() == [0] * (len(episode) - 1) + [1]
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import json
 import pathlib
+import zlib
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from palpate.tasks import registry
-from palpate.tasks.learn.demonstrations import Demonstration, instruction
+from palpate.tasks.learn.demonstrations import LEVEL, Demonstration, instruction
 
 from . import About
 
@@ -65,8 +66,23 @@ def _add(group: Any, demo: Demonstration) -> None:
   for name, value in demo.forces.items():
     group[f"forces/{name}"] = value[1:]
   for name, value in demo.observations.items():
-    packed: dict[str, Any] = {}
-    if value.ndim > 2 and value.shape[1] > 8:  # pictures
-      packed = {"chunks": (1, *value.shape[1:]), "compression": "gzip", "compression_opts": 4}
-    group.create_dataset(f"obs/{name}", data=value[:-1], **packed)
-    group.create_dataset(f"next_obs/{name}", data=value[1:], **packed)
+    if value.ndim > 2 and value.shape[1] > 8:
+      _add_pictures(group, name, value)
+    else:
+      group[f"obs/{name}"], group[f"next_obs/{name}"] = value[:-1], value[1:]
+
+
+def _add_pictures(group: Any, name: str, pictures: np.ndarray) -> None:
+  """Adds pictures (n, height, width, ...), each compressed once for both of its places."""
+  (count, *size), still = pictures.shape, (0,) * (pictures.ndim - 1)
+  packed = {"chunks": (1, *size), "compression": "gzip", "compression_opts": LEVEL}
+  now, then = (
+    group.create_dataset(f"{which}/{name}", (count - 1, *size), pictures.dtype, **packed)
+    for which in ("obs", "next_obs")
+  )
+  for k, picture in enumerate(pictures):
+    chunk = zlib.compress(picture.tobytes(), LEVEL)  # what HDF5's gzip writes
+    if k < count - 1:
+      now.id.write_direct_chunk((k, *still), chunk)
+    if k > 0:
+      then.id.write_direct_chunk((k - 1, *still), chunk)
