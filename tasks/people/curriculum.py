@@ -38,6 +38,7 @@ AFTER |= {
   "suture/drive_standard": "suture/drive_easy",
   "suture/drive_hard": "suture/drive_standard",
   "suture/running_easy": "suture/drive_easy",
+  "suture/running_standard": "suture/running_easy",
   "suture/extracorporeal_easy": "touch/easy",
   "probe/palpate_hard": "probe/palpate_standard",
 }

@@ -1,10 +1,11 @@
 """Running: close a cut with a running suture of four stitches, with two wristed needle drivers.
 
-A stretched wall has a cut of 25 mm, which gapes by 2 mm. Four stitches are to close it, 6 mm apart
-and 4 mm from its edges, with one thread of polypropylene 3-0 that ends in a bead. Some of them are
-placed already, but loose. The right hand drives the needle through the two marks of a stitch,
-the left one takes its tip and draws needle and thread through. After the last one the thread is
-pulled until the gap is under a millimetre, and held so for half a second: no knot is tied.
+A stretched wall has a cut of 25 mm, which gapes by 2 mm. Four
+stitches are to close it, 6 mm apart and 4 mm from its edges, with one thread of polypropylene 3-0
+that ends in a bead. Some of them are placed already, but loose. The right hand drives the needle
+through the two marks of a stitch, the left one takes its tip and draws needle and thread through.
+After the last one the thread is pulled until the gap is under a millimetre, and held so for half a
+second: no knot is tied.
 
 The thread meets the wall in its holes alone, and it floats: there is no gravity. The lips of the
 cut do not touch each other.
@@ -36,6 +37,7 @@ import palpate
 import warp as wp
 from palpate.models import trocar, wrist
 from palpate.tissue.types import Array, floats, ints
+from scipy import optimize
 
 from ...core.base import Physics
 from ...core.performer import Performer, Script
@@ -72,7 +74,6 @@ from .needles import (
   MEETS,
   QUARTER,
   RADIUS,
-  TOUGH,
   WALL,
   WIDE,
   Hands,
@@ -98,6 +99,7 @@ from .needles import (
 
 STITCHES, PITCH, BITE = 4, 0.006, 0.004  # [m]: between stitches, and from the edge of the cut
 TENSION = 40.0  # of the wall [N/m]
+_TOUGH = 1200.0  # as `TOUGH`: more, since stitches are pulled tight in it
 CUT = (-0.0135, 0.0075)  # vertices of the wall that the cut divides, along y [m]
 CLOSED, HELD = 0.001, 0.5  # gap of a cut that is closed [m], and how long it is to stay so [s]
 THREAD, EDGE = 0.12, 0.0015  # length of the thread, and of its edges [m]
@@ -115,7 +117,7 @@ _RIGHT, _LEFT = (math.radians(-72.0), math.radians(-30.0)), (math.radians(58.0),
 # then is [rad], how high the needle is brought over the wall, how far a hand goes back and up [m],
 # and what it pulls with [N].
 _OUT, _HIGH, _BACK, _UP, _PULL = math.radians(92.5), 0.012, 0.01, 0.008, 0.7
-_MORE = 0.02  # how the pull grows [N/s]
+_MORE, _SHUT = 0.02, 0.7  # how the pull grows [N/s], and share of the limit at which it is enough
 _LITTLE, _DRAWN = 0.01, 0.03  # slack that is drawn in with care [m], and how fast more is [m/s]
 # How far it turns at once [rad], how high it is handed over [m], tension of a thread without slack
 # [N], and which way it is pulled.
@@ -125,7 +127,13 @@ _LOOK, _OVER, _TAUT, _WAY = 0.6, 0.02, 0.3, np.array([0.6, 0.35, 0.72])
 @exercise("suture/running_easy", 40, "easy", "bimanual")
 def easy(**kwargs):
   """Place the last of four stitches within 3 mm of its marks, and close the cut."""
-  return Running(FIELD, **{"placed": 3, "tolerance": 0.003, "tough": 1200.0, **kwargs})
+  return Running(FIELD, **{"placed": 3, "tolerance": 0.003, **kwargs})
+
+
+@exercise("suture/running_standard", 80, "bimanual")
+def standard(**kwargs):
+  """Place two of four stitches within 2 mm of their marks, and close the cut."""
+  return Running(FIELD, **{"placed": 2, "tolerance": 0.002, "jitter": 0.002, **kwargs})
 
 
 class State(Hands):
@@ -147,7 +155,7 @@ class State(Hands):
   closed: float  # how long the gap has been under the limit [s]
   pull: float  # of needle and thread on the wall [N]
   pulled: float  # the largest so far [N]
-  deepest: float  # how far the needle was under the wall [m]
+  deepest: float  # how far the needle was under its first mark [m]
   tightest: float  # largest tension so far [N]
   torn: float  # how far a hole has torn at most [m]
   target: Vector
@@ -197,7 +205,7 @@ def advance(s, o):
     o.torn = max(o.torn, torn_at(s, k))
   o, worst = open_holes(s, o, min(count, number))
   if o.holes > 2 * o.done:
-    o.deepest = max(o.deepest, -lowest(s))
+    o.deepest = max(o.deepest, float(place(s, o, now(o))[2]) - lowest(s))
   o.through = 0.0
   if o.holes == 2 * o.done + 2:
     _, along = pinhole(s, o.holes - 1)
@@ -273,7 +281,6 @@ class Running(Stitching):
     tolerance: float,
     close: float = CLOSED,
     tension: float = TENSION,
-    tough: float = TOUGH,
     **kwargs,
   ):
     """Makes the task.
@@ -285,11 +292,10 @@ class Running(Stitching):
       tolerance: how far holes may be from their marks [m]
       close: gap that is closed [m]
       tension: of the wall [N/m]
-      tough: energy that it takes to open an area of the wall [J/m^2]
       **kwargs: see Task
     """
     self.placed, self.tolerance, self.close = placed, tolerance, close
-    self.tension, self.tough = tension, tough
+    self.tension = tension
     self.edges = sheet.slit(*sheet.sheet(kwargs.get("nodes") or scene.nodes), CUT)[2]
     self.pairs = len(self.edges)
     kwargs = {"force_limit": 3.0, "damage": 8.0, **kwargs}
@@ -297,8 +303,8 @@ class Running(Stitching):
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: a wall with a cut in a frame, and the needle with its thread."""
-    law = {"needles": f"needle {self.tough:g} {FRICTION:g}", "tension": self.tension}
-    spec = sheet.stretched(self._scene(variant), WALL | law, _MASS, slots=_SLOTS, span=CUT)
+    tissue = WALL | {"needles": f"needle {_TOUGH:g} {FRICTION:g}", "tension": self.tension}
+    spec = sheet.stretched(self._scene(variant), tissue, _MASS, slots=_SLOTS, span=CUT)
     spec.option.gravity = np.zeros(3)
     self.meet(spec)
     apart = np.array([0.1, 0.0, -0.05])  # until an episode begins
@@ -478,6 +484,8 @@ class Running(Stitching):
     most = _PULL * self.tension / TENSION * p.style.force
     while not enough():
       most += _MORE * p.dt  # nobody stops short of what is wanted
+      if self.gap < _SHUT * self.close:
+        most = min(most, self.tight)
       careful = p.care * float(np.clip(0.05 * (most - self.tight), -0.01, 0.025))
       speed = _DRAWN * p.style.speed if self._slack(p.physics) > _LITTLE else careful
       p.tip = p.tip + speed * p.dt * _WAY
@@ -518,13 +526,13 @@ def _laid(holes: np.ndarray, swage: np.ndarray) -> np.ndarray:
     line.append(start + share[:-1, None] * (end - start) + down[:-1, None] * (0.0, 0.0, 1.0))
   top = holes[-1] + share[:, None] * (0.0, 0.0, _RISE)
   seam = np.concatenate([*line, top])
-  over, angle, bow = THREAD - _along(seam), 0.0, seam
-  low, high = 0.1, math.pi - 0.1
-  for _ in range(30):
-    angle = 0.5 * (low + high)
-    bow = _bow(swage, seam[-1], angle)
-    low, high = (angle, high) if _along(bow) < over else (low, angle)
-  return np.concatenate([bow, seam[-2::-1]])
+  over = THREAD - _along(seam)
+
+  def left(angle: float) -> float:
+    return over - _along(_bow(swage, seam[-1], angle))
+
+  found = optimize.root_scalar(left, bracket=(0.1, math.pi - 0.1))
+  return np.concatenate([_bow(swage, seam[-1], found.root), seam[-2::-1]])
 
 
 def _along(line: np.ndarray) -> float:
