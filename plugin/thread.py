@@ -127,14 +127,15 @@ class Thread:
     out[organ.free] += self.data.qpos[at] - self.model.qpos0[at]
     return out
 
-  def lay(self, points: np.ndarray, nodes: Sequence[int] | None = None):
-    """Puts it, or a part of it, at rest along a line, its edges as long as at rest.
+  def lay(self, points: np.ndarray, nodes: Sequence[int] | None = None, tension: float = 0.0):
+    """Puts it, or a part of it, at rest along a line.
 
     Args:
       points: of the line, from the first of the nodes on, in the world [m]; beyond it the thread
         goes on straight                                               (n, 3)
       nodes: that lie along it, from one of them to an end of the thread; what they leave stays
         where it is. None for all, whose twist and breaks are forgotten then
+      tension: of its edges there [N]
 
     Raises:
       ValueError: it has pinned nodes, or the nodes are not one after the other.
@@ -146,6 +147,7 @@ class Thread:
     if abs(np.diff(which)).max(initial=1) != 1 or abs(which[-1] - which[0]) != len(which) - 1:
       raise ValueError(f"thread {self.name!r}: nodes is {nodes}, expected one after the other")
     length = np.linalg.norm(np.diff(organ.rest[which], axis=0), axis=1)
+    length += tension / self._space.constants["stretch"][np.minimum(which[1:], which[:-1])]
     last = line[-1] - line[-2]
     line = np.concatenate([line, line[-1:] + length.sum() / np.linalg.norm(last) * last])
     places, k = [line[0]], 0

@@ -510,6 +510,15 @@ def test_a_ball_falls_through_a_thread_that_it_breaks(strength):
   assert thread.error is None
 
 
+def test_a_part_of_a_thread_is_laid_under_tension():
+  _, _, thread = load(line(31, 0.03), option=FREE)
+  before = thread.positions
+  thread.lay([before[10], (0.004, 0.004, 0), (-0.03, 0, 0.002)], np.arange(10, -1, -1), 0.5)
+  np.testing.assert_allclose(thread.positions[10:], before[10:], atol=1e-12)
+  # A chord of the corner is as long as the edge.
+  np.testing.assert_allclose(thread.tension, np.repeat([0.5, 0.0], [10, 20]), atol=1e-6)
+
+
 def test_a_step_that_is_not_solved_is_told():
   model, data, thread = load(line(31, 0.06), pin=(0,), iterations=1, option=FREE)
   data.qvel[1::3] = np.sin(np.linspace(0, 9, 30))
