@@ -4,8 +4,8 @@ FLS task 4. The thread goes through the marks of a slit Penrose drain, see `drai
 come up to the hands outside. These are not simulated: each strand's end is on a slide along it and
 is drawn with a fixed pull. A throw is laid loosely around both strands, high over the drain. One of
 them, the post, goes through the ring of the pusher, which takes the throw down by contact alone. A
-throw is seated when it is down and the slit is closed to 1 mm, for 0.3 s. With the pusher back at
-the mark, the hands outside tie the next throw, the other way round.
+throw is seated when it is down, no slack is left below it and the slit is closed to 1 mm, for
+0.3 s. With the pusher back at the mark, the hands outside tie the next throw, the other way round.
 
 Own observations, in the world: `target` (3,), from the tip to where the throw is to be, or to the
 mark that the pusher is to go back to [m]; `throw` (3,), from the tip to the throw [m]; `gap` (1,),
@@ -16,7 +16,8 @@ stitch is lifted and pulled apart, harder and harder to 2 N.
 
 Progress: (seated + 0.9 * closeness of the throw to its seat, 0 at the least) / throws. Success: all
 throws are seated; of several the knot is right, see `palpate.tasks.metrics.knots`, the slit is
-closed to 1 mm when the strands are let go, and gapes less than unsewn, 2.4 mm, up to a pull of 1 N.
+closed to 1 mm when the strands are let go, and gapes less than unsewn, 2.4 mm, up to a pull of
+0.6 N, with which its strands were drawn.
 The pull at which it gapes so is the knot's security. Failure: a knot that is not so, a thread that
 breaks or tears out of the drain, a force above the damage limit, or the time limit.
 
@@ -24,7 +25,7 @@ It has no vectorised form: a batch cannot lay a thread and sew it while it runs.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -47,7 +48,7 @@ EDGE = 4.5e-4  # of the thread, four of its radii [m]
 PULL = 0.6  # of each hand outside [N]
 HIGH = 0.010  # of a throw that is laid over what it is to be pushed to [m]
 _HANDS = np.array([0.0, -0.006, 0.026])  # from the stitch to between the hands outside [m]
-_APART = 0.004  # of these [m]
+_APART = 0.008  # of these [m]
 _MASS, _DAMPING = 0.02, 5.0  # of each, on its slide [kg], [N s/m]
 # Of a throw that is laid: from the strands to its middle, and its length [m].
 _LOOSE, _LONG = 2.5e-4, 0.0024  # the length is that of three half turns
@@ -55,11 +56,13 @@ _LOOSE, _LONG = 2.5e-4, 0.0024  # the length is that of three half turns
 _POLISHED = 0.1
 _TURNS = 121  # points that it is laid with
 _PAST = 6e-4  # from strands that cross over it to between them [m]
-_TOUCH = 3.0  # radii between the middles of strands that touch
+_TOUCH = 1.5 * EDGE  # between nodes of strands that touch [m]
 _SEAT = 0.003  # a throw no higher over the holes is down [m]
 _STAYS = 0.3  # and is to stay there for so long [s]
+_SNUG = 0.0018  # of a strand in a throw that is drawn tight, at most, for each half turn [m]
 _LET_GO = 0.3  # strands lie so long before the knot is tested [s]
-_HOLDS, _LAST, _RISES = 1.0, 2.0, 2.0  # pull that it is to hold, the last [N], and the rise [N/s]
+_HOLDS, _LAST, _RISES = PULL, 2.0, 2.0  # pull that it is to hold, the last [N], and the rise [N/s]
+_TRIES, _LIFT = 6, np.array([0.0, 0.0, 0.002])  # of the expert at a throw, and between them [m]
 _MARK = 0.018  # height of the mark over the drain [m]
 
 
@@ -118,11 +121,11 @@ class Extracorporeal(Task):
 
   def begin(self, physics: Physics) -> None:
     """Lays the first throw, and puts the pusher's ring around the post above it."""
-    self.hand = int(self.random.choice([-1, 1]))  # the way round of the first throw
+    # The way round of the first throw. The pusher takes the post past the tail on the side of +y,
+    # where it comes from: a left-handed second throw lies flat so, another one capsizes.
+    self.hand = int(self.random.choice([-1, 1])) if self.throws == 1 else 1
     post, tail = strands(HIGH + self.random.uniform(-0.001, 0.001), self.hand, self.turns[0])
     places = drain.sew(physics.organ, _line(post, tail)).positions
-    marks = [np.linalg.norm(places - strand[0], axis=1).argmin() for strand in (post, tail)]
-    self.sides = np.arange(marks[0] - 2, -1, -1), np.arange(marks[1] + 2, len(places))
     ring = post[-2] + self.random.uniform(0.5, 0.6) * (post[-1] - post[-2])
     physics.set_joints(np.insert(trocar.inverse(physics.trocar(), ring), 2, 0.0))
     self.pull(physics, PULL)
@@ -133,7 +136,8 @@ class Extracorporeal(Task):
     self.laid, self.seated, self.stayed, self.free = 1, 0, 0.0, 0.0
     self.high0 = HIGH
     self.gap = self.left = drain.GAPE  # now, and before the knot was pulled at
-    self.tension = 0.0
+    self.tension = self.below = self.sunk = 0.0
+    self.slack = False
     self.knot, self.pulled, self.held = "", 0.0, 0.0
     self.stitch, self.throw = MIDDLE, post[1:-1].mean(axis=0)
 
@@ -147,18 +151,23 @@ class Extracorporeal(Task):
     thread = physics.thread
     assert thread
     places = thread.positions
-    post, tail = (places[side] for side in self.sides)
-    near = np.linalg.norm(post[:, None] - tail[None], axis=2) < 0.5 * _TOUCH * EDGE
-    ring = np.linalg.norm(post - physics.tip_pos(), axis=1).argmin()
-    rows = np.flatnonzero(near[: ring + 1].any(axis=1))  # no throw is beyond it
-    self.throw = post[rows[-1]] if len(rows) else 0.5 * (post[0] + tail[0])
-    self.gap = drain.gap(physics.nodes(), self.scene.nodes)
     self.tension = float(thread.tension.max())
     self.broken = bool(thread.broken.any())
     holes = physics.organ.pinholes
     self.whole = len(holes) == 2
-    if holes:
-      self.stitch = np.mean([hole.at for hole in holes], axis=0)
+    if not self.whole:
+      return
+    self.stitch = np.mean([hole.at for hole in holes], axis=0)
+    # It slides in its holes: what is outside of them now.
+    first, second = sorted(int(-hole.along / EDGE) for hole in holes)
+    self.sides = np.arange(first, -1, -1), np.arange(second + 1, len(places))
+    post, tail = (places[side] for side in self.sides)
+    near = np.linalg.norm(post[:, None] - tail[None], axis=2) < _TOUCH
+    ring = np.linalg.norm(post - physics.tip_pos(), axis=1).argmin()
+    rows = np.flatnonzero(near[: ring + 1].any(axis=1))  # no throw is beyond it
+    self.throw = post[rows[-1]] if len(rows) else 0.5 * (post[0] + tail[0])
+    self.below = EDGE * max(rows[-1], np.flatnonzero(near[rows[-1]])[0]) if len(rows) else 0.0
+    self.gap = drain.gap(physics.nodes(), self.scene.nodes)
 
   def advance(self, physics: Physics) -> float:
     """Follows the throw down; see the module's head."""
@@ -169,10 +178,12 @@ class Extracorporeal(Task):
       return -1.0
     high = float(self.throw[2] - self.stitch[2])
     waits = self.laid == self.seated
-    down = high < _SEAT and self.gap < CLOSED
+    snug = _SNUG * (2 * self.turns[self.laid - 1] + 1)
+    self.slack = high < _SEAT and self.below - self.sunk > snug
+    down = high < _SEAT and self.gap < CLOSED and not self.slack
     self.stayed = self.stayed + self.control_timestep if down and not waits else 0.0
     if self.stayed > _STAYS - 1e-6:
-      self.seated, self.stayed = self.seated + 1, 0.0
+      self.seated, self.stayed, self.sunk = self.seated + 1, 0.0, self.below
       self.event(physics, "target", self.gap, "throw")
       waits = True
     if self.seated == self.throws:
@@ -201,7 +212,7 @@ class Extracorporeal(Task):
       self.knot = knots.name(places)
       wound = [-self.hand * (-1) ** k * turns for k, turns in enumerate(self.turns)]
       right = sorted(knots.throws(places) or ()) == sorted(wound)
-      if right and self.held >= _HOLDS:
+      if right and self.held > _HOLDS - 1e-6:
         self.outcome = "success"
         return 1.0
       self.outcome = "missed"
@@ -221,7 +232,7 @@ class Extracorporeal(Task):
     hand = self.hand * (-1) ** self.laid
     lines = again([places[side] for side in self.sides], top, hand, self.turns[self.laid])
     for side, (first, line) in zip(self.sides, lines, strict=True):
-      thread.lay(line, side[first:])
+      thread.lay(line, side[first:].tolist(), PULL)
     for name, node, way in _ends(len(places)):
       place = thread.positions[node] - physics.model.ptr.body(name).pos
       physics.data.joint(name).qpos[0] = place @ way
@@ -266,6 +277,8 @@ class Extracorporeal(Task):
     """Says what is next."""
     if self.laid == self.seated < self.throws:
       return "Take the pusher back up to the yellow mark"
+    if self.slack:
+      return "Slack is left below the throw: lift the pusher a little, and push again"
     return f"Push throw {self.laid} of {self.throws} down until the slit is closed"
 
   def expert(self, p: Performer) -> Script:
@@ -275,17 +288,25 @@ class Extracorporeal(Task):
       laid = self.laid
       goal = np.array([0.0, 0.0, drain.HIGH + 0.001])
       yield from p.move(goal, speed=0.02)
-      for _ in range(round(3.0 / p.dt)):
+      for _ in range(_TRIES):
+        yield from _until(p, 0.8, lambda laid=laid: self.seated == laid)
         if self.seated == laid:
           break
-        yield p.step()
+        # A throw that is pressed on locks. Let go, it slides on and the hands draw the slack up.
+        yield from p.line(goal + _LIFT, speed=0.02)
+        yield from p.line(goal, speed=0.02)
       if self.seated == self.throws:
         yield from Performer.wait(p, math.inf)
       yield from p.move(self.mark, speed=0.03)
-      for _ in range(round(0.5 / p.dt)):
-        if self.laid > laid:
-          break
-        yield p.step()
+      yield from _until(p, 0.5, lambda laid=laid: self.laid > laid)
+
+
+def _until(p: Performer, most: float, done: Callable[[], bool]) -> Script:
+  """Holds still until a condition, or for a time [s]."""
+  for _ in range(round(most / p.dt)):
+    if done():
+      return
+    yield p.step()
 
 
 # Strands, and throws around them.
@@ -337,11 +358,12 @@ def again(
   base = [strand[k] for strand, k in zip(strands, first, strict=True)]
   ends = [strand[k] for strand, k in zip(strands, last, strict=True)]
   below, above = np.mean(base, axis=0), np.mean(ends, axis=0)
-  wound = twist(below + 0.6 * (above - below), hand, turns)
+  wound = twist(below + 0.4 * (above - below), hand, turns)
   wound = wound if base[0][0] > base[1][0] else wound[::-1]
   out = []
   for k in (0, 1):
-    cross = 0.5 * (wound[k][-1] + ends[k]) + np.array([0.0, _PAST * (1 - 2 * k), 0.0])
+    cross = wound[k][-1] + 0.3 * (ends[k] - wound[k][-1])
+    cross[1] += _PAST * (1 - 2 * k)
     line = np.concatenate([[base[k]], wound[k], [cross], strands[k][last[k] :]])
     out.append((first[k], line))
   return out
