@@ -40,6 +40,8 @@ AFTER |= {
   "suture/running_easy": "suture/drive_easy",
   "suture/running_standard": "suture/running_easy",
   "suture/extracorporeal_easy": "touch/easy",
+  "suture/extracorporeal_standard": "suture/extracorporeal_easy",
+  "suture/extracorporeal_hard": "suture/extracorporeal_standard",
   "probe/palpate_hard": "probe/palpate_standard",
 }
 RULE = f"{CONSECUTIVE} proficient attempts in a row and {REPEATS} more"

@@ -72,6 +72,18 @@ def easy(**kwargs):
   return Extracorporeal(FIELD, **{"turns": (1,), **kwargs})
 
 
+@exercise("suture/extracorporeal_standard", 30)
+def standard(**kwargs):
+  """Push down two throws, a square knot that holds 0.6 N."""
+  return Extracorporeal(FIELD, **{"turns": (1, 1), **kwargs})
+
+
+@exercise("suture/extracorporeal_hard", 45, "hard")
+def hard(**kwargs):
+  """Push down three throws, the first double, a surgeon's knot that holds 0.6 N."""
+  return Extracorporeal(FIELD, **{"turns": (2, 1, 1), **kwargs})
+
+
 class Extracorporeal(Task):
   """Push throws down with a knot pusher."""
 

@@ -76,6 +76,8 @@ const GERMAN = {
   "drive it within # mm, in changing directions": "stich sie auf # mm genau, in wechselnden Richtungen",
   "drive it within # mm, as FLS asks for, through a tougher wall": "stich sie auf # mm genau, wie FLS es verlangt, durch eine zähere Wand",
   "push one throw down, and close the slit to # mm": "schiebe einen Wurf hinunter und schließe den Schlitz auf # mm",
+  "push down two throws, a square knot that holds # N": "schiebe zwei Würfe hinunter, einen Kreuzknoten, der # N hält",
+  "push down three throws, the first double, a surgeon's knot that holds # N": "schiebe drei Würfe hinunter, den ersten doppelt, einen chirurgischen Knoten, der # N hält",
   // What runs.
   "Loading {0}": "Lädt {0}", "Loading {0}, which takes a minute or more": "Lädt {0}, das dauert eine Minute oder mehr",
   "{0}: {1} s. The first time, kernels are compiled, for up to a minute": "{0}: {1} s. Beim ersten Mal werden Rechenkerne übersetzt, bis zu einer Minute lang",
@@ -148,6 +150,7 @@ const GERMAN = {
   "Take the needle's tip with the left hand, and draw it through": "Nimm die Nadelspitze mit der linken Hand und ziehe sie durch",
   "Pull the thread until the cut is closed, and hold it": "Ziehe am Faden, bis der Schnitt zu ist, und halte ihn",
   "Turn the needle about its circle, to the yellow mark": "Drehe die Nadel um ihren Kreis, zur gelben Marke", "Turn it on until the tip is out": "Drehe weiter, bis die Spitze heraus ist",
+  "Slack is left below the throw: lift the pusher a little, and push again": "Unter dem Wurf ist noch loser Faden: hebe den Schieber etwas an und schiebe erneut",
   "Push throw # of # down until the slit is closed": "Schiebe Wurf # von # hinunter, bis der Schlitz zu ist",
   "Take the pusher back up to the yellow mark": "Nimm den Schieber zurück bis zur gelben Marke",
   "Knot security": "Halt des Knotens",
