@@ -19,13 +19,12 @@ from collections.abc import Sequence
 import numpy as np
 from palpate.models.handle import Shaft, times
 
-from .devices.device import STILL, Device, DeviceError, Four, Guard, Reading, Three
-from .devices.relative import Desk
+from .devices.device import STILL, Device, DeviceError, Four, Reading, Three
+from .devices.reader import Reader
 
 _SAME: Four = (1.0, 0.0, 0.0, 0.0)
 _STIRS, _TURNS = 2e-4, 0.005  # of a hand that begins [m], [rad]
 _CLOSE, _OPEN = 2.0, -0.6  # speed of the jaws by button [1/s], and where they grip
-RETRY = 0.5  # between tries to find a device again [s]
 # Energy that the hand may get before it gives any, and most that is kept account of [J].
 _LENT, _CREDIT = 1e-3, 0.05
 _LIGHTEST = 0.05  # of hands with a device [kg]
@@ -116,10 +115,8 @@ class Link:
   """One device and the handle it moves.
 
   Attributes:
-    device: the hand's
     options: of the coupling
     state: `ready`, `clutch`, `lost` or `waiting` for the first reading
-    message: the last fault, for people
     row: place [m] and orientation of the anchor  (7,)
     jaw: opening of the jaws [-]
     head: what the hand says of a camera's head, which takes the place of jaws [-]
@@ -138,17 +135,15 @@ class Link:
       options: of the coupling
       h: step of the loop [s]
     """
-    self.device, self.options, self._h = device, options or Options(), h
-    self._time()
-    self.guard = Guard(device)
+    self._reader, self.options, self._h = Reader(device), options or Options(), h
     self.force: Three = STILL
-    self.state, self.message = "waiting", ""
+    self.state = "waiting"
     self.row, self.jaw, self.paused = [0.0] * 3 + list(_SAME), 1.0, False
     self.head = 0.0
     self.grip = self.report = False
     self.energy, self._asked = _LENT, False
     self._place, self._turn = Track(h), Track(h)
-    self._heard, self._tried, self._gain = 0.0, 0.0, 0.0
+    self._gain = 0.0
     self._reference: tuple[Reading, list[float], Four, float] | None = None
     self._roll = 0.0
     self._next: Device | None = None
@@ -158,6 +153,16 @@ class Link:
     self._leant = (0.0, 0.0)  # of the last reading
     self.attach(None, STILL, _SAME, np.eye(3))
     self.quiet()
+
+  @property
+  def device(self) -> Device:
+    """The hand's."""
+    return self._reader.device
+
+  @property
+  def message(self) -> str:
+    """The last fault of the device, for people."""
+    return self._reader.message
 
   def attach(
     self, shaft: Shaft | None, pos: Sequence[float], quat: Sequence[float], axes: np.ndarray,
@@ -179,6 +184,7 @@ class Link:
     if shaft is not None:
       self._roll = shaft.roll(pos, quat)
     self._hold([float(x) for x in pos], tuple(float(x) for x in quat))
+    self._reader.wait()
     self.state = "waiting"
 
   def turn(self, axes: np.ndarray) -> None:
@@ -223,18 +229,11 @@ class Link:
 
   def _change(self, device: Device) -> None:
     self.quiet()
-    before, self.device, self._next = self.device, device, None
     # A library may take its time over it.
-    threading.Thread(target=before.close, daemon=True).start()
-    self.guard, self.message = Guard(self.device), ""
-    self._time()
+    threading.Thread(target=self.device.close, daemon=True).start()
+    self._reader, self._next = Reader(device), None
     self._hold(self.row[:3], tuple(self.row[3:]))
     self.state = "waiting"
-
-  def _time(self) -> None:
-    """Lets keys and sticks go by the simulation's time, however fast that passes."""
-    if isinstance(self.device, Desk):
-      self.device.step = self._h
 
   # From hand to handle.
 
@@ -247,26 +246,21 @@ class Link:
     """
     if self._next is not None:
       self._change(self._next)
-    if self.state == "lost" and not self._find(now):
+    reading = self._reader.read(now, self._h, self.options.patience)
+    if self._reader.state == "lost":
+      if self.state != "lost":
+        self.state = "lost"
+        self.hold()
       return False
-    try:
-      reading = self.device.read(now)
-    except DeviceError as error:
-      return self._lose(now, str(error))
+    if self.state == "lost":
+      self.state = "waiting"
     if reading is not None:
-      verdict = self.guard.check(reading, now)
-      if verdict == "bad":
-        reading, self.message = None, self.guard.last
-      elif verdict == "jump":
+      if self._reader.state == "jump":
         self._hold(self.row[:3], tuple(self.row[3:]))
-        self._felt_at, self.message = None, self.guard.last
-    if reading is not None:
-      self._heard = now
+        self._felt_at = None
       self._take(reading, tip)
     elif self.state == "waiting":
       return False
-    elif now - self._heard > self.options.patience + 1 / self.device.rate:
-      return self._lose(now, f"{self.device.name}: no reading for {now - self._heard:.2f} s")
     self._advance()
     return True
 
@@ -351,26 +345,6 @@ class Link:
       quat = (w * scale, x * scale, y * scale, z * scale)
     self.row = [*pos, *quat]
 
-  # Faults.
-
-  def _lose(self, now: float, message: str) -> bool:
-    self.state, self.message, self._tried = "lost", message, now
-    self.hold()
-    self.guard.forget()
-    return False
-
-  def _find(self, now: float) -> bool:
-    if now - self._tried < RETRY:
-      return False
-    self._tried = now
-    try:
-      there = self.device.reopen()
-    except DeviceError as error:
-      self.message, there = str(error), False
-    if there:
-      self.state, self._heard = "waiting", now
-    return there
-
   # From handle to hand.
 
   def _motion(self, reading: Reading) -> None:
@@ -436,7 +410,8 @@ class Link:
       try:
         device.send(force, torque)
       except DeviceError as error:
-        self.state, self.message, self.force = "lost", str(error), STILL
+        self._reader.lose(str(error))
+        self.state, self.force = "lost", STILL
 
 
 def _into(m: list[float], x: float, y: float, z: float, scale: float) -> Three:

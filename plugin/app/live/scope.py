@@ -15,9 +15,9 @@ import numpy as np
 from palpate.models import laparoscope, trocar
 from palpate.models.laparoscope import Pose
 
-from .coupling import RETRY, Options
-from .devices.device import Device, DeviceError, Guard, Reading
-from .devices.relative import Desk
+from .coupling import Options
+from .devices.device import Device, Reading
+from .devices.reader import Reader
 
 DEPTH = 0.08  # from the trocar to the lens where a scene begins [m]
 REACH = (-0.04, 0.12)  # of the insertion from there [m]
@@ -35,9 +35,7 @@ class Scope:
   Other threads may set `follows`.
 
   Attributes:
-    device: of the hand that holds it
     follows: whether it keeps the tip in the picture's middle by itself
-    message: what is wrong with the device, for people; empty where nothing is
     pos: of the lens [m]  (3,)
     mat: the picture's axes right, up, back in columns  (3, 3)
   """
@@ -55,16 +53,18 @@ class Scope:
       fovy: its vertical field of view [deg]
       optics: angle between shaft and view [rad]
     """
-    self.device, self.follows, self.pos, self.mat = device, False, pos, mat
+    self._reader, self.follows, self.pos, self.mat = Reader(device), False, pos, mat
     self._optics, self._half = optics, math.tan(math.radians(fovy) / 2)
     self._port = laparoscope.behind(pos, mat, DEPTH, optics)
     self._joints = Pose(0.0, 0.0, 0.0, 0.0, 0.0)
     self._tilt = laparoscope.level(mat)  # that the camera is held at [rad]
-    self.message, self._guard = "", Guard(device)
     self._last: Reading | None = None
-    self._heard = math.inf  # when the device last said something [s]
-    self._gone = -math.inf  # when it was last looked for, as it is gone [s]
     self._straying = False
+
+  @property
+  def message(self) -> str:
+    """What is wrong with the device, for people; empty where nothing is."""
+    return "" if self._reader.state == "good" else self._reader.message
 
   def advance(self, now: float, dt: float, tip: np.ndarray, nodes: np.ndarray) -> bool:
     """Takes it on by a control step; returns whether the view has changed.
@@ -76,9 +76,7 @@ class Scope:
       nodes: of the organ, which the lens keeps away from [m]  (n, 3)
     """
     before = self._joints, self._tilt
-    if isinstance(self.device, Desk):
-      self.device.step = dt
-    self._hold(now)
+    self._hold(now, dt)
     if self.follows:
       self._follow(dt, tip)
     if (self._joints, self._tilt) == before:
@@ -97,36 +95,14 @@ class Scope:
     head = self._tilt - laparoscope.level(laparoscope.view(self._port, level, self._optics)[1])
     return laparoscope.view(self._port, level._replace(head=head), self._optics)
 
-  def _read(self, now: float) -> Reading | None:
-    """Returns the reading of a device that may be gone, silent, or say what no hand does."""
-    if now - self._gone < RETRY:
-      return None
-    try:
-      if self._gone > -math.inf and not self.device.reopen():
-        self._gone = now
-        return None
-      reading, self._gone = self.device.read(now), -math.inf
-    except DeviceError as error:
-      self.message, self._gone, self._last = str(error), now, None
-      self._guard.forget()
-      return None
-    if reading is None:
-      if now - self._heard > Options.patience:
-        self.message, self._last = f"{self.device.name}: no reading for {Options.patience} s", None
-        self._guard.forget()
-      return None
-    verdict, self._heard = self._guard.check(reading, now), now
-    self.message = "" if verdict == "good" else self._guard.last
-    if verdict == "jump":
-      self._last = None
-    return None if verdict == "bad" else reading
-
-  def _hold(self, now: float) -> None:
+  def _hold(self, now: float, dt: float) -> None:
     """Does what the hand does."""
-    reading, last = self._read(now), self._last
+    reading = self._reader.read(now, dt, Options.patience)
+    if self._reader.state in ("jump", "lost"):
+      self._last = None
     if reading is None:
       return
-    self._last = reading
+    last, self._last = self._last, reading
     if reading.jaw is not None and not self.follows:
       self._tilt = math.pi * reading.jaw
     if last is None or "clutch" in reading.buttons:

@@ -1,4 +1,4 @@
-"""What a device for the hand is, and the check of what it says.
+"""What a device for the hand is.
 
 Axes of a device: x to the right, y up, z towards the person, as the laparoscope's picture has them.
 """
@@ -6,7 +6,6 @@ Axes of a device: x to the right, y up, z towards the person, as the laparoscope
 from __future__ import annotations
 
 import importlib
-import math
 from typing import Any, NamedTuple, Protocol
 
 Three = tuple[float, float, float]
@@ -117,41 +116,3 @@ def library(module: str, extra: str, also: str = "") -> Any:
     return importlib.import_module(module)
   except (ImportError, OSError, AttributeError) as error:
     raise DeviceError(f"{extra}: {error}; pip install 'palpate[{extra}]'{also}") from error
-
-
-FASTEST = 3.0  # a hand's speed; what is faster is a jump [m/s]
-_STEP = 0.01  # which no reading need explain [m]
-
-
-class Guard:
-  """Finds what is no movement of a hand.
-
-  Attributes:
-    last: the last fault, for people; empty without one
-  """
-
-  def __init__(self, device: Device):
-    self._device, self._before, self._time = device, None, 0.0
-    self.last = ""
-
-  def forget(self) -> None:
-    """Takes the next reading as the first one."""
-    self._before = None
-
-  def check(self, reading: Reading, now: float) -> str:
-    """Returns `good`, `jump` for a movement that no hand makes, `bad` for what is no pose."""
-    pos, quat, roll, jaw, _, lean = reading
-    numbers = pos[0] + pos[1] + pos[2] + roll + sum(quat or lean) + (jaw or 0.0)
-    if not math.isfinite(numbers) or (quat and sum(q * q for q in quat) < 1e-6):
-      pose = f"{pos} {quat or ''}".strip()
-      self.last = f"{self._device.name}: pose is {pose}, expected finite numbers"
-      return "bad"
-    before, self._before = self._before, pos
-    span, self._time = now - self._time, now
-    if before is None:
-      return "good"
-    moved = math.dist(before, pos)
-    if moved <= _STEP + FASTEST * span:
-      return "good"
-    self.last = f"{self._device.name}: jumped {1e3 * moved:.0f} mm in {1e3 * span:.0f} ms"
-    return "jump"
