@@ -19,10 +19,11 @@ let go with the site between there and half of the lift. Slipping from the jaws 
 before it is lowered start the holding again. Failure: a force above the damage limit, jaws
 included, or the time limit.
 
-Shaping: until it is grasped 0.36 * `ready`, for jaws that are open near the site, are over the fold
-and close on it; then 0.3 * (1 - min(height / lift, 1)), less 0.15 * d / (1 + d) where the fold is
-pushed down by d lifts. Once held long enough it is 0, and 0.015 * (1 - 2 * pinch / force limit),
-not below 0, while the fold rests low: jaws that loosen are about to let go.
+Shaping: until it is grasped 0.24 * `ready`, for jaws that are open near the site, are over the fold
+and close on it; then 0.26 - (0.14 + 0.12 * held) * min(height / lift, 1), less 0.15 * d / (1 + d)
+where the fold is pushed down by d lifts. So no grasp is paid less than what led to it, down to d of
+4, and most of what follows for the lift. Once held long enough it is 0, and 0.015 * (1 - 2 * pinch
+/ force limit), not below 0, while the fold rests low: jaws that loosen are about to let go.
 """
 
 import dataclasses
@@ -72,6 +73,7 @@ OVER = 0.005  # how far the tip may go past a site before it is paid less: jaws 
 REST = 0.2  # at a low height before release [s]
 # Heights that it rests between, and is let go below, as shares of the lift.
 LOW, RESTING, LETTING = -0.25, 0.4, 0.5
+READY = 0.24  # shaping of jaws that are closed on the site, less than that of any grasp [-]
 LOOSE = 0.015  # shaping of jaws that hold a fold at rest without force [-]
 
 
@@ -283,10 +285,10 @@ def shaping(s, o):
     loose = clamp(1.0 - 2.0 * pinch(s) / o.force_limit, 0.0, 1.0)
     return LOOSE * loose if o.lowered >= REST - SLACK else 0.0
   if o.grasped == 0.0:
-    return 0.36 * ready(s, o)
+    return READY * ready(s, o)
   share = raised(s, o) / o.lift
-  pushed = max(-share, 0.0)
-  return 0.3 * (1.0 - clamp(share, 0.0, 1.0)) - 0.15 * pushed / (1.0 + pushed)
+  high, pushed = clamp(share, 0.0, 1.0), max(-share, 0.0)
+  return 0.26 - high * (0.14 + 0.12 * min(o.time / o.hold, 1.0)) - 0.15 * pushed / (1.0 + pushed)
 
 
 def observe(s, o):

@@ -12,7 +12,7 @@ instruments are not looked at. Success: the wanted share is seen for the holding
 being grasped and the force under its limit; what is above it does not count. Failure: a force above
 the damage limit, jaws included, or the time limit.
 
-Shaping: until it is grasped 0.36 * `ready`, as in `grasp`; then 0.3 * (1 - visible / wanted).
+Shaping: until it is grasped 0.24 * `ready`, as in `grasp`; then 0.3 * (1 - visible / wanted).
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ from ..core.rules import (
 )
 from ..core.scenes import Scene
 from ..registry import exercise
-from .grasp import FUNDUS, Held, Hold, follow, near, ready
+from .grasp import FUNDUS, READY, Held, Hold, follow, near, ready
 from .touch import SLACK
 
 _BEHIND = 0.02  # from the organ's middle to the disc [m]
@@ -118,7 +118,7 @@ def advance(s, o):
 def shaping(s, o):
   """Returns what tells the way to a grasp."""
   if o.grasped == 0.0:
-    return 0.36 * ready(s, o)
+    return READY * ready(s, o)
   return 0.3 * (1.0 - min(o.visible / o.wanted, 1.0))
 
 

@@ -176,7 +176,8 @@ def test_a_potential_shows_the_way_to_a_grasp():
   assert loose[1] < 0.5 * grasp.LOOSE < 0.9 * grasp.LOOSE < loose[2] <= grasp.LOOSE
   assert potential["pressed, closed"] < potential["over it"] - 0.1
   assert potential["sunk in aside, closed"] < potential["beside"]
-  assert potential["deep"] < potential["pushed"] - 0.02 < potential["grasped"] - 0.04
+  assert potential["closing"] < potential["deep"] < potential["pushed"] - 0.02
+  assert potential["pushed"] < potential["grasped"] - 0.02
 
 
 def test_quick_forms_agree_with_the_plain_ones():
