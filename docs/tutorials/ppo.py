@@ -1,38 +1,29 @@
 """Learn an exercise from nothing: proximal policy optimisation in one file, with torch alone.
 
-    python docs/tutorials/ppo.py grasp/easy > curve.csv                # a GPU, 1024 worlds
+    python docs/tutorials/ppo.py retract/easy > curve.csv              # a GPU, 1024 worlds
     python docs/tutorials/ppo.py touch/easy --device cpu --worlds 32   # the same, slowly
 
-No expert and no demonstration takes part. The environment pays the change of a potential, which
-tells the way from anywhere in the scene (tasks/core/base.py, "Reward"). The algorithm is that of
-Schulman et al. 2017 (10.48550/arXiv.1707.06347) with generalised advantages; the learning rate
-follows the change of the policy. What matters beside it:
-
-- Jaws are told to go a small step from where they are. On tissue that is a gentle force in
-  proportion to the action; at full force a fold is over the limit at once, and grasping does harm.
-- Who grasps moves slowly, so that noise does not shake what is held, and is shown the last
-  millimetres to the site on a scale of their own: they decide whether a fold is between the jaws.
-- Rewards of a size that a network tells from its own noise: those of an episode add up to 10.
-- Episodes in which nothing was gained for a second or three begin anew.
+No expert takes part: the environment pays the change of a potential, which tells the way. The
+algorithm is that of Schulman et al. 2017 (10.48550/arXiv.1707.06347), its learning rate adaptive.
 """
 
 import argparse
-import math
 import time
-from typing import Any
 
 import gymnasium
 import palpate.tasks  # noqa: F401 - registers the exercises
 import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 
-GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.99, 0.95, 0.2, 5, 8
-KL, ENTROPY, NOISE = 0.015, 0.001, 0.4  # change of the policy aimed at, in a minibatch
-STEPS, SCALE = 16, 10.0  # control steps of an iteration, and how much larger rewards are
-JAW, CLOSED, WIDE = 0.03, -0.2, 1.0472  # a step of the jaws, and where they may be told to go [rad]
-PACE, FINE = 0.4, 0.005  # with jaws: share of the rates, and of what size offsets are seen too [m]
-PATIENCE, GAIN = (50, 150), 0.05  # control steps without so much more paid that end an episode
-UNSEEN = ("surface",)  # 96 numbers on the whole organ, which these exercises do not need
+GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.99, 0.95, 0.2, 5, 4
+KL, ENTROPY, NOISE = 0.02, 0.001, 0.4  # change of the policy aimed at, in a minibatch
+STEPS, SCALE = 8, 10.0  # decisions of an iteration; of rewards, which add up to that
+FINE, LEFT = 0.005, 0.05  # the last of the way [m] and of the progress have scales of their own
+REPEAT, PACE = 2, 0.4  # control steps of a decision, and share of the rates that it uses
+CLOSE, OPEN = 0.075, 0.225  # what jaws close and open in a step at full rate: gentle forces [rad]
+CLOSED, WIDE = -0.2, 1.0472  # where jaws are told to go by -1 and 1 [rad]
+PATIENCE, GAIN = 100, 0.05  # an episode ends after so many decisions, at most, that gain no more
+ENOUGH = 0.9  # success without noise that ends the training
 
 
 class Agent(nn.Module):
@@ -41,66 +32,48 @@ class Agent(nn.Module):
   def __init__(self, nseen: int, naction: int):
     """Makes the networks, the policy's with actions near 0."""
     super().__init__()
-    self.normal = nn.BatchNorm1d(nseen, eps=1e-6, momentum=None, affine=False).eval()
+    self.normal = nn.BatchNorm1d(nseen, eps=1e-6, momentum=None, affine=False)
     self.mean, self.value = (
-      nn.Sequential(
-        nn.Linear(nseen, 256), nn.ELU(), nn.Linear(256, 128), nn.ELU(), nn.Linear(128, nout)
-      )
-      for nout in (naction, 1)
+      nn.Sequential(nn.Linear(nseen, 256), nn.ELU(), nn.Linear(256, 128), nn.ELU(), last)
+      for last in (nn.Linear(128, naction), nn.Linear(128, 1))
     )
     nn.init.normal_(self.mean[-1].weight, std=1e-3)
-    self.noise = nn.Parameter(torch.full((naction,), math.log(NOISE)))
+    self.noise = nn.Parameter(torch.full((naction,), NOISE).log())
 
-  def forward(self, seen: torch.Tensor) -> tuple[torch.distributions.Normal, torch.Tensor]:
+  def forward(self, rows: torch.Tensor) -> tuple[torch.distributions.Normal, torch.Tensor]:
     """Returns how actions are distributed, and the values."""
-    normal = self.normal(seen).clamp(-5, 5)
-    policy = torch.distributions.Normal(self.mean(normal), self.noise.exp())
-    return policy, self.value(normal)[:, 0]
-
-  def look(self, seen: torch.Tensor) -> None:
-    """Takes observations into the means and variances that all are normalised by."""
-    self.normal.train()(seen)
-    self.normal.eval()
+    normal = self.normal(rows).clamp(-5, 5)
+    return torch.distributions.Normal(self.mean(normal), self.noise.exp()), self.value(normal)[:, 0]
 
 
-class Worlds:
-  """An exercise in many worlds, as the agent has it."""
+def look(seen: dict[str, torch.Tensor]) -> torch.Tensor:
+  """Returns observations as rows, with the target in the frame of the tip too  (nworld, n)."""
+  own = {name: x.flatten(1).float() for name, x in seen.items() if name != "surface"}
+  turn, target = own["tip_quat"], own["target"]
+  aside = 2 * torch.linalg.cross(turn[:, 1:], target)
+  fine = (target - turn[:, :1] * aside + torch.linalg.cross(turn[:, 1:], aside)) / FINE
+  return torch.cat([*own.values(), fine.tanh(), ((1 - own["progress"]) / LEFT).tanh()], 1)
 
-  def __init__(self, task: str, count: int, device: str):
-    """Makes the worlds."""
-    name = f"palpate/{''.join(map(str.title, task.split('/')))}-v0"
-    self.env: Any = gymnasium.make_vec(name, num_envs=count, device=device, output="torch")
-    self.naction = self.env.single_action_space.shape[0]
 
-  def reset(self, **which: Any) -> torch.Tensor:
-    """Begins episodes; returns what is seen  (nworld, nseen)."""
-    return self.rows(self.env.reset(**which)[0])
-
-  def rows(self, seen: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Returns observations as rows  (nworld, nseen)."""
-    self.progress = seen["progress"].float()
-    rows = [v.flatten(1).float() for k, v in seen.items() if k not in UNSEEN]
-    self.opening = seen["gripper"][:, :1] if "gripper" in seen else None
-    if self.opening is not None:
-      rows.append((seen["target"].float() / FINE).clamp(-1, 1))
-    return torch.cat(rows, 1)
-
-  def step(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Takes a control step; returns what is seen, paid, and whether it is won: 1, 0, NaN as yet."""
-    told = action.clamp(-1, 1)
-    if self.opening is not None:
-      share = 2 * (self.opening + JAW * told[:, 4:] - CLOSED) / (WIDE - CLOSED) - 1
-      told = torch.cat([PACE * told[:, :4], share.clamp(-1, 1)], 1)
-    seen, paid, _, _, info = self.env.step(told.float())
-    won = torch.full((len(told),), math.nan, device=told.device)
+def step(env, seen: dict, action: torch.Tensor) -> tuple[dict, torch.Tensor, torch.Tensor]:
+  """Acts; returns what is seen, what was paid, and of an episode's end 1 if won, 0 if not, NaN."""
+  total, won = torch.zeros_like(action[:, 0]), torch.full_like(action[:, 0], torch.nan)
+  for _ in range(REPEAT):
+    told = PACE * action.clamp(-1, 1)
+    if "gripper" in seen:
+      goal = seen["gripper"][:, :1] + told[:, 4:] * torch.where(told[:, 4:] > 0, OPEN, CLOSE)
+      told[:, 4:] = (2 * (goal - CLOSED) / (WIDE - CLOSED) - 1).clamp(-1, 1)
+    seen, paid, _, _, info = env.step(told)
+    total += SCALE * paid.float() * won.isnan()
     if "final_info" in info:
-      over = torch.as_tensor(info["_final_info"], device=told.device)
-      won[over] = info["final_info"]["success"].float().flatten()[over]
-    return self.rows(seen), SCALE * paid.float().flatten(), won
+      over = torch.as_tensor(info["_final_info"], device=won.device) & won.isnan()
+      won = torch.where(over, info["final_info"]["success"].float(), won)
+  return seen, total, won
 
 
+@torch.enable_grad()
 def update(agent: Agent, adam: torch.optim.Adam, data: list[torch.Tensor]) -> None:
-  """Takes some passes over the steps of an iteration."""
+  """Takes some passes over the decisions of an iteration."""
   for _ in range(EPOCHS):
     for rows in torch.randperm(len(data[0]), device=data[0].device).chunk(MINIBATCHES):
       seen, action, before, mean, advantage, value = (each[rows] for each in data)
@@ -119,75 +92,58 @@ def update(agent: Agent, adam: torch.optim.Adam, data: list[torch.Tensor]) -> No
 
 
 @torch.no_grad()
-def judge(agent: Agent, worlds: Worlds, enough: float) -> float:
+def judge(agent: Agent, env) -> float:
   """Returns the share of worlds that succeed without noise, up to where it is clear."""
-  seen = worlds.reset(seed=1_000_000)
-  won = torch.full((len(seen),), math.nan, device=seen.device)
-  while (won == 1).float().mean() < enough and (won == 0).float().mean() <= 1 - enough:
-    seen, _, ended = worlds.step(agent(seen)[0].mean)
-    won = torch.where(won.isnan(), ended, won)
+  seen, won = env.reset(seed=1_000_000)[0], torch.tensor(torch.nan)
+  while not ((won == 1).float().mean() >= ENOUGH or (won == 0).float().mean() > 1 - ENOUGH):
+    seen, _, ended = step(env, seen, agent(look(seen))[0].mean)
+    won = torch.where(won.to(ended).isnan(), ended, won)
   return float((won == 1).float().mean())
 
 
+@torch.no_grad()
 def main() -> None:
   """Learns until enough worlds succeed, or the time is over; prints the curve."""
   parser = argparse.ArgumentParser(description="Learns an exercise from nothing.")
-  add = parser.add_argument
-  add("task", nargs="?", default="touch/easy")
-  add("--device", default="cuda:0", help="cuda:0, cpu or warp-cpu (%(default)s)")
-  add("--worlds", type=int, default=1024)
-  add("--minutes", type=float, default=5.0)
-  add("--enough", type=float, default=0.9, help="successes without noise (%(default)s)")
-  add("--seed", type=int, default=0)
+  parser.add_argument("task", nargs="?", default="touch/easy")
+  for name, most in {"device": "cuda:0", "worlds": 1024, "minutes": 5.0, "seed": 0}.items():
+    parser.add_argument(f"--{name}", type=type(most), default=most, help="(%(default)s)")
   args = parser.parse_args()
   torch.manual_seed(args.seed)
-  start = time.time()
-  worlds = Worlds(args.task, args.worlds, args.device)
-  for _ in range(2):  # kernels are compiled in the first step, and recorded in the second
-    seen = worlds.reset(seed=args.seed)
-    worlds.step(torch.zeros(args.worlds, worlds.naction, device=seen.device))
-  seen = worlds.reset(seed=args.seed)
-  agent = Agent(seen.shape[1], worlds.naction).to(seen.device)
+  start, name = time.time(), f"palpate/{args.task.title().replace('/', '')}-v0"
+  env = gymnasium.make_vec(name, num_envs=args.worlds, device=args.device, output="torch")
+  seen = env.reset(seed=args.seed)[0]
+  agent = Agent(look(seen).shape[1], env.action_space.sample().shape[1]).to(look(seen).device)
   adam = torch.optim.Adam(agent.parameters(), lr=1e-3)
-  won, earned, best, idle = (torch.zeros(args.worlds, device=seen.device) for _ in range(4))
-  patience = torch.randint(*PATIENCE, (args.worlds,), device=seen.device)
-  made, start = time.time() - start, time.time()
-  seconds, iteration, due, judged = 0.0, 0, 0, math.nan
-  agent.look(seen)
-  print("task,seed,made,steps,seconds,success,judged,progress,most,paid")
-  while not (judged >= args.enough or seconds > 60 * args.minutes):
-    rows = []
-    with torch.no_grad():
-      for _ in range(STEPS):
-        policy, value = agent(seen)
-        action = policy.sample()
-        after, paid, ended = worlds.step(action)
-        over = ~ended.isnan()
-        chance = policy.log_prob(action).sum(1)
-        rows.append((seen, action, chance, policy.mean, paid, over.float(), value))
-        won, earned = torch.where(over, ended, won), earned + paid
-        idle = torch.where(over | (earned > best + GAIN), 0.0, idle + 1)
-        best = torch.where(idle > 0, best, earned)
-        earned, best, seen = earned * ~over, best * ~over, after
-      *told, paid, over, value = (torch.stack(column) for column in zip(*rows, strict=True))
-      advantage, following, gain = torch.zeros_like(paid), agent(seen)[1], torch.zeros_like(won)
-      for k in reversed(range(STEPS)):
-        surprise = paid[k] + GAMMA * following * (1 - over[k]) - value[k]
-        advantage[k] = gain = surprise + GAMMA * LAMBDA * (1 - over[k]) * gain
-        following = value[k]
-    if iteration:  # after the first one it knows how large observations are
+  seen, won, _ = step(env, seen, agent(look(seen))[0].mean)  # compiles kernels
+  won, lead, idle = torch.zeros(3, len(won), device=won.device)
+  made, steps, judged, start = time.time() - start, 0, torch.nan, time.time()
+  print("task,seed,made,steps,seconds,success,judged,paid")
+  while not (judged >= ENOUGH or time.time() - start > 60 * args.minutes):
+    data = []
+    for _ in range(STEPS):
+      policy, value = agent.eval()(rows := look(seen))
+      action = policy.sample()
+      seen, paid, ended = step(env, seen, action)
+      goes, before = ended.isnan(), policy.log_prob(action).sum(1)
+      data.append((rows, action, before, policy.mean, paid, goes.float(), value))
+      won, lead, idle = torch.where(goes, won, ended), lead + paid, idle + 1
+      lead, idle = (x * (goes & (lead < GAIN)) for x in (lead, idle))
+    *told, paid, goes, value = (torch.stack(column) for column in zip(*data, strict=True))
+    advantage, gain, after = torch.zeros_like(paid), 0.0, [*value[1:], agent(look(seen))[1]]
+    for k in reversed(range(STEPS)):
+      advantage[k] = gain = paid[k] - value[k] + GAMMA * goes[k] * (after[k] + LAMBDA * gain)
+    if steps:  # after the first iteration it knows how large observations are
       update(agent, adam, [x.flatten(0, 1) for x in (*told, advantage, advantage + value)])
-    agent.look(told[0].flatten(0, 1))
-    iteration, success, stuck = iteration + 1, float(won.mean()), idle > patience
-    if success >= args.enough and iteration >= due:
-      judged, due, stuck = judge(agent, worlds, args.enough), iteration + 20, idle > -1
-    seconds, steps = time.time() - start, iteration * STEPS * args.worlds
-    told = success, judged, worlds.progress.mean(), worlds.progress.max(), paid.sum(0).mean()
-    row = ",".join(f"{x:.4g}" for x in told)
-    print(f"{args.task},{args.seed},{made:.1f},{steps},{seconds:.1f},{row}", flush=True)
-    if stuck.any():
-      seen = worlds.reset(options={"reset_mask": stuck.cpu().numpy()})
-      earned, best, idle, won = (x * ~stuck for x in (earned, best, idle, won))
+    agent.train()(told[0].flatten(0, 1))
+    steps, success = steps + REPEAT * goes.numel(), float(won.mean())
+    stuck = idle > PATIENCE * (0.3 + 0.7 * torch.rand_like(idle))
+    if success >= ENOUGH:
+      judged, stuck = judge(agent.eval(), env), idle >= 0
+    row = f"{time.time() - start:.1f},{success:.4g},{judged:.4g},{paid.sum(0).mean():.4g}"
+    print(f"{args.task},{args.seed},{made:.1f},{steps},{row}", flush=True)
+    seen = env.reset(options={"reset_mask": stuck.cpu().numpy()})[0]
+    won, lead, idle = (x * ~stuck for x in (won, lead, idle))
 
 
 if __name__ == "__main__":
