@@ -19,11 +19,12 @@ from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import DIMS, fill
 
 from .kernels import forget, put_back_rows
-from .patch import launch
 
 if TYPE_CHECKING:
   from .organs import Organ
   from .worlds import Worlds
+
+_BLOCK = 32  # threads of a block, a warp: with several sizes modules would be compiled for each
 
 
 class Host(host.Host):
@@ -118,14 +119,12 @@ class Host(host.Host):
 
   def load(self, kernel: Twin):
     """See `Host`."""
-    kernel.many.load(self.device)
+    kernel.many.load(self.device, _BLOCK)
 
   def launch(self, kernel: Twin, fields: Any, count: int = 0, arg: int = 0):
     """See `Host`."""
-    if count:
-      launch(kernel.many, fields, self.nworld, count, self.device, arg)
-    else:
-      kernel.many.launch(self.device, self.nworld, 1, arg, fields, 32)
+    nthread = -(-count // _BLOCK) * _BLOCK if count and self.device.is_cuda else 1
+    kernel.many.launch(self.device, self.nworld, nthread, arg, fields, _BLOCK)
 
   def rest(self):
     """Puts what worlds keep where those of the mask start, and gives these the first lists."""

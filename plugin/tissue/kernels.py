@@ -46,9 +46,15 @@ class Kernel:
     """Returns the kernel for a device."""
     return self.cuda if device.is_cuda else self.cpu
 
-  def load(self, device: wp.Device):
-    """Loads its module on a device, compiling it where the cache has none."""
-    wp.load_module(self.on(device).module.name, device=device)
+  def load(self, device: wp.Device, block_dim: int | None = None):
+    """Loads its module on a device, compiling it where the cache has none.
+
+    Args:
+      device: where
+      block_dim: threads of a block, see `launch`: for others CUDA code is compiled anew
+    """
+    block_dim = block_dim if device.is_cuda else None
+    wp.load_module(self.on(device).module.name, device=device, block_dim=block_dim)
 
   def launch(
     self, device, nworld: int, nthread: int, arg: int, fields, block_dim: int | None = None
