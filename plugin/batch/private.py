@@ -1,6 +1,6 @@
 """What batches need of mujoco_warp's private modules, since its public ones lack it."""
 
-from mujoco_warp._src import passive, sensor, solver
+from mujoco_warp._src import passive, sensor, solver, support
 from mujoco_warp._src.collision_core import Geom
 from mujoco_warp._src.collision_gjk import ccd
 from mujoco_warp._src.collision_primitive_core import (
@@ -28,3 +28,8 @@ __all__ = [
   "DeterminismType", "Geom", "GeomType", "OverflowType", "box_triangle", "capsule_triangle", "ccd",
   "contact_kbimp", "jac_dof", "passive", "ray_geom", "sensor", "solver", "sphere_triangle", "vec5",
 ]  # fmt: skip
+
+# Large functions with many callers: inlined, they made kernels of contacts with flexes, of which we
+# need neither interpolated ones nor boxes of rods, take a minute to compile on CUDA.
+for _each in (support.add_flex_interp_weights, support.contact_bodies_and_weights):
+  _each.inline_hint = "noinline"
