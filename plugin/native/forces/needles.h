@@ -138,7 +138,7 @@ PALPATE Seat seat_of_hole(const Fields& f, double* s, int h) {
 }
 
 template <class Fields>
-PALPATE double place_of_hole(const Fields& f, const Arc& arc, double* s, int h) {
+CALLED double place_of_hole(const Fields& f, const Arc& arc, double* s, int h) {
   return on_thread(s, h) ? 0.0 : arc.nearest(seat_of_hole(f, s, h).at);
 }
 
@@ -191,7 +191,7 @@ PALPATE Strand<Fields> strand_of(const Fields& f, int i) {
 // Finds the triangle that a line goes through, nearest to its end; one whose normal is along the line by `facing`
 // (1 along, -1 against, 0 either).
 template <class Fields>
-PALPATE bool find_triangle(const Fields& f, Thread me, const Line& s, int facing, int& elem, D3& weight) {
+CALLED bool find_triangle(const Fields& f, Thread me, const Line& s, int facing, int& elem, D3& weight) {
   return find_crossing(f, me, s, elem, weight, [&](const D3* x, double at) {
     return facing * dot(cross(x[1] - x[0], x[2] - x[0]), s.along) < 0.0 ? NOWHERE : s.length - at;
   }) >= 0.0;
@@ -218,7 +218,7 @@ PALPATE void touch(const Fields& f, Thread t, int i, const Arc& arc, D3 fast, do
 
 // Puts the seat of a tip in a solid on a place; returns whether that is in it.
 template <class Fields>
-PALPATE bool sit_inside(const Fields& f, Thread t, D3 place, double* s) {
+CALLED bool sit_inside(const Fields& f, Thread t, D3 place, double* s) {
   int tet = s[NEEDLE_STAGE] == INSIDE ? (int)s[NEEDLE_ELEM] : 0;
   D3 w;
   if (!find_tet(f, t, place, tet, w)) return false;
@@ -294,7 +294,7 @@ PALPATE void cut_way(const Fields& f, Thread t, int i, const Arc& arc, double* s
 // Adds a force on a point of tissue, at a place of the needle, that falls by `hold` dv / h in the step; it is the needle
 // that feels it, or the thread by itself.
 template <class Fields>
-PALPATE void tie(const Fields& f, Thread t, int at, const Seat& seat, D3 place, D3 force, const Sym& hold, bool feels) {
+CALLED void tie(const Fields& f, Thread t, int at, const Seat& seat, D3 place, D3 force, const Sym& hold, bool feels) {
   if (t.tid > 0) return;
   f.feels.data[at] = feels;
   store(f.force.data + 3 * at, force);
@@ -320,7 +320,7 @@ PALPATE Sym across_and_along(double a, double b, D3 n) {
 struct Passing { int edge; double part, angle; D3 at, along; };
 
 template <class Fields>
-PALPATE Passing passing(const Fields& f, int i, const Arc& arc, double place) {
+CALLED Passing passing(const Fields& f, int i, const Arc& arc, double place) {
   const auto thread = strand_of(f, i);
   Passing out;
   const int e = out.edge = thread.find(place, out.part);
@@ -338,7 +338,7 @@ PALPATE Passing passing(const Fields& f, int i, const Arc& arc, double place) {
 // Length in tissue at a hole: a sheet's thickness; in a solid half the way to each hole next to it, from the last one to
 // the tip all of it.
 template <class Fields>
-PALPATE double length_in(const Fields& f, int i, const Arc& arc, double* s, int n) {
+CALLED double length_in(const Fields& f, int i, const Arc& arc, double* s, int n) {
   const int count = (int)s[NEEDLE_COUNT], kind = kind_of(s, n);
   const double wall = f.law.data[PIERCE_LENGTH * i + PIERCE_WALL];
   if (on_thread(s, n)) {
@@ -355,7 +355,7 @@ PALPATE double length_in(const Fields& f, int i, const Arc& arc, double* s, int 
 
 // What the tissue bears across a needle or a thread at a hole.
 template <class Fields>
-PALPATE double bears_across(const Fields& f, int i, const Arc& arc, double* s, int n) {
+CALLED double bears_across(const Fields& f, int i, const Arc& arc, double* s, int n) {
   const double* law = f.law.data + PIERCE_LENGTH * i;
   const double made = law[f.ntet && kind_of(s, n) != WITHIN ? PIERCE_SURFACE : PIERCE_FORCE];
   const double cut = law[PIERCE_TEAR] * length_in(f, i, arc, s, n);
@@ -365,7 +365,7 @@ PALPATE double bears_across(const Fields& f, int i, const Arc& arc, double* s, i
 // Lets a hole tear through the tissue by a way against what that bears; returns whether it is one still, rather than torn
 // out of the tissue's edge.
 template <class Fields>
-PALPATE bool tear_by(const Fields& f, Thread t, double* s, int n, D3 way, double bears) {
+CALLED bool tear_by(const Fields& f, Thread t, double* s, int n, D3 way, double bears) {
   double* my = hole(s, n);
   const D3 from = seat_of_hole(f, s, n).at, to = from + way;
   int elem = (int)my[HOLE_ELEM];
@@ -418,7 +418,7 @@ PALPATE void tear_by_thread(const Fields& f, Thread t, int i, const Arc& arc, do
 // What friction of a thread in a hole bears along it, of the difference of the tensions on both sides of the edge that is
 // in it.
 template <class Fields>
-PALPATE double thread_friction(const Fields& f, int i, const Arc& arc, const Passing& by, const Seat& seat, double* s,
+CALLED double thread_friction(const Fields& f, int i, const Arc& arc, const Passing& by, const Seat& seat, double* s,
                                int n) {
   const double* law = f.law.data + PIERCE_LENGTH * i;
   const auto thread = strand_of(f, i);
@@ -467,7 +467,7 @@ PALPATE void tie_thread(const Fields& f, Thread t, int i, int n, const Arc& arc,
 // Closes holes that the tip has been drawn out of, and lets go of those that the swage has left, or hands them to the
 // thread, those in the surface. It may come back, or end.
 template <class Fields>
-PALPATE void close_holes(const Fields& f, Thread t, int i, const Arc& arc, double* s) {
+CALLED void close_holes(const Fields& f, Thread t, int i, const Arc& arc, double* s) {
   const auto thread = strand_of(f, i);
   const bool stops = f.law.data[PIERCE_LENGTH * i + PIERCE_STOP] > 0.0;
   int count = (int)s[NEEDLE_COUNT], kept = 0;
