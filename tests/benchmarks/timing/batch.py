@@ -13,6 +13,11 @@ share the worlds: `--device cuda:0+cuda:1`.
     palpate bench batch --device cuda:0 --nodes 258 --worlds 256 --thread 57
 
 lays a silk 3-0 of so many nodes, 2.5 mm apart, over the sphere in place of the ball.
+
+    palpate bench batch --device cuda:0 --nodes 400 --worlds 256 --bend 0 --fls
+
+steps the scene of FLS's knots: a slit drain, a thread that is sewn through it with a throw laid
+over it, a needle, and two needle drivers with wrists that hold still.
 """
 
 from __future__ import annotations
@@ -31,6 +36,8 @@ import warp as wp
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate.models.meshing import grid
+from palpate.tasks.core.scenes import Scene
+from palpate.tasks.domains.suturing import drain, extracorporeal
 
 RADIUS, BALL, H, DEEP = 0.05, 0.006, 1e-3, 0.006
 EDGE = 2.5e-3  # of a thread [m]
@@ -62,6 +69,22 @@ def lay(spec: mujoco.MjSpec, count: int):
   palpate.add_thread(spec, np.stack([r * np.sin(angle), 0 * s, r * np.cos(angle) - below], axis=1))
 
 
+def knots(nodes: int) -> tuple[mujoco.MjSpec, mujoco.MjData, int]:
+  """Returns the scene of FLS's knots, how it starts, and the nodes of its thread."""
+  ports = {"port": (-0.06, 0.04, 0.13), "second_port": (0.06, 0.04, 0.13)}
+  post, tail = extracorporeal.strands(extracorporeal.HIGH, 1)
+  line = np.concatenate([post[::-1], tail])
+  along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
+  at = np.arange(0.0, along[-1], extracorporeal.EDGE)
+  line = np.stack([np.interp(at, along, column) for column in line.T], axis=1)
+  spec = drain.build(Scene(instrument="psm", second="psm", nodes=nodes, **ports), line)
+  model = spec.copy().compile()
+  data = mujoco.MjData(model)
+  mujoco.mj_forward(model, data)
+  drain.sew(palpate.Organ(model, data, "organ"), line)
+  return spec, data, len(line)
+
+
 def depths(nworld: int) -> np.ndarray:
   """Returns how deep the ball of each world is driven, the first one deepest [m]."""
   return np.linspace(DEEP, 0.5 * DEEP, nworld)
@@ -71,7 +94,7 @@ def press(batch, record: bool = False) -> np.ndarray:
   """Drives the balls down; returns the force on the first world's in each step [N]."""
   forces = []
   for k in range(STEPS):
-    if batch.model.nu:
+    if batch.model.nu == 1:
       batch.ctrl = -(depths(batch.nworld) * min(1.0, 1.5 * k / STEPS))[:, None]
     batch.step()
     if record:
@@ -94,15 +117,21 @@ def measure(
   tolerance: float,
   repeat: bool,
   thread: int = 0,
+  fls: bool = False,
 ) -> dict:
   """Returns what steps of a batch take."""
-  spec = scene(nodes, bend, condim, tolerance, thread)
+  spec, data = scene(nodes, bend, condim, tolerance, thread), None
+  if fls:
+    spec, data, thread = knots(nodes)
   names = device.split("+")
   start, target = time.perf_counter(), wp.get_device(names[0] if "cuda" in names[0] else "cpu")
   free = target.free_memory if target.is_cuda else 0
   where = names if len(names) > 1 else device
   batch = palpate.batch.make(spec, nworld, where, nodes=slots, deterministic=repeat)
   made, rms = time.perf_counter() - start, float("nan")
+  if data:
+    batch.start(data)
+    batch.reset()
   if nworld <= 1024 and condim == 1 and not thread:
     found, expected = press(batch, record=True), alone(scene(nodes, bend, condim, tolerance))
     rms = float(np.sqrt(np.mean((found - expected) ** 2)) / np.abs(expected).max())
@@ -113,7 +142,7 @@ def measure(
   used = (free - target.free_memory) / here if target.is_cuda else float("nan")
   before = time.perf_counter()
   for k in range(STEPS // 10):
-    if batch.model.nu:
+    if batch.model.nu == 1:
       batch.ctrl = -(depths(nworld) - 0.001 * (k % 2))[:, None]
     batch.step(10)
   wp.synchronize()
@@ -183,16 +212,18 @@ def arguments(parser: argparse.ArgumentParser):
   add("--tolerance", type=float, default=1e-3)
   add("--slots", type=int, nargs="+", help="nodes that the ball may touch, one a size or for all")
   add("--thread", type=int, default=0, help="nodes of a thread in place of the ball")
+  add("--fls", action="store_true", help="the scene of FLS's knots in place of the sphere")
   add("--repeat", action="store_true", help="runs that repeat to the bit whatever the GPU does")
 
 
 def stages(args: argparse.Namespace) -> list[list[Case]]:
   """Returns a case a size, number of worlds, and kind of tissue and contact."""
-  keys = {name: getattr(args, name) for name in ("device", "tolerance", "repeat", "thread")}
+  keys = {name: getattr(args, name) for name in ("device", "tolerance", "repeat", "thread", "fls")}
   slots = args.slots or [None]
   slots = dict(zip(args.nodes, slots * (len(args.nodes) // len(slots)), strict=True))
   worlds = args.worlds or ([8] if args.device == "cpu" else [1024, 4096, 16384])
   kind = "-repeat" * args.repeat + f"-thread{args.thread}" * bool(args.thread)
+  kind += "-fls" * args.fls
   many = f"-x{args.device.count('+') + 1}" * ("+" in args.device)
   cases = [
     {"case": f"{n}-{w}-{bend:g}-{c}-{slots[n] or 0}{kind}{many}", "nodes": n, "nworld": w}
