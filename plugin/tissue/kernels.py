@@ -25,6 +25,12 @@ NATIVE = pathlib.Path(__file__).parents[1] / "native"
 MODULES: dict[str, dict[str, dict[str, int | float]]] = {"cpu": {}, "cuda": {}}
 
 
+@wp.func_native(snippet="WP_TILE_SYNC();")
+def meet_block():
+  """Waits for the threads of a block: each then sees what the others have written."""
+  ...
+
+
 @dataclasses.dataclass(frozen=True)
 class Kernel:
   """A native function as kernels of Warp: on CUDA a launch brings its struct along.

@@ -20,6 +20,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.tissue.kernels import meet_block
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
 from .. import private
@@ -109,12 +110,6 @@ class Touches:
   out: floats("nworld", "nsensordata")
 
 
-@wp.func_native(snippet="WP_TILE_SYNC();")
-def _wait():
-  """Waits for the threads of the block, and sees what they have written."""
-  ...
-
-
 @wp.kernel(enable_backward=False)
 def _list_contacts(p: Pairs):
   """Lists the contacts of each world."""
@@ -138,7 +133,7 @@ def _sort_contacts(p: Pairs):
   w, lane = wp.tid()
   lanes = wp.block_dim()
   n = wp.min(p.count[w], _ROOM)
-  _wait()
+  meet_block()
   if lane == 0:
     p.count[w] = 0
   if n <= 1:
@@ -154,14 +149,14 @@ def _sort_contacts(p: Pairs):
       rank += wp.where(_pair_key(p, other) < key, 1, 0)
     p.place[w, at] = c
     p.to[w, k] = rank
-  _wait()
+  meet_block()
   for f in range(p.moved.shape[0]):
     kept = p.kept[f].words
     width = kept.shape[1]
     for q in range(lane, n * width, lanes):
       k = q / width
       kept[p.place[w, p.to[w, k]], q % width] = p.moved[f].words[p.listed[w, k], q % width]
-  _wait()
+  meet_block()
   for f in range(p.moved.shape[0]):
     moved = p.moved[f].words
     width = moved.shape[1]
@@ -207,7 +202,7 @@ def _sort_rows(r: Rows):
       kept[w, to] = r.moved[f].words[w, k]
   for q in range(lane, n * nv, lanes):
     r.whole[w, q / nv, q % nv] = 0.0
-  _wait()
+  meet_block()
   for k in range(lane, n, lanes):
     for f in range(r.moved.shape[0]):
       column = r.moved[f].words
@@ -304,7 +299,7 @@ def _update(
     square[w] = whole[0]
     decrement[w] = 0.0
     scale[w] = 1.0
-  _wait()
+  meet_block()
   if n == 0:
     return
   for entry in range(thread, nv * (nv + 1) // 2, wp.block_dim()):
@@ -408,7 +403,7 @@ def sort_matches(most: int) -> wp.Kernel:
           match[w, s, k + 1] = a
           criterion[w, s, k] = criterion[w, s, k + 1]
           criterion[w, s, k + 1] = of_a
-      _wait()
+      meet_block()
 
   return sort_matches
 
