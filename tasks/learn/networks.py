@@ -31,10 +31,11 @@ HIDDEN = ("joint_vel", "drive", "tip_vel", "surface")  # from an actor that is t
 ACTING, MORE = "acting", "more"  # groups of observations
 CHANGES = ("jaw", "head")  # ends of components that an actor says as changes: jaws close by and by
 POWER = 2.0  # an action is what the actor says times its size: slow motion is as clear as fast
-CLONING = 700  # steps of the optimiser of a round
+CLONING = 700  # steps of the optimiser of a round, by default
 _BATCH, _RATE = 32, 3e-3  # lessons of a step
 FINE = 0.1  # errors above count by their size, not their square [-]
 _SELDOM = 0.01  # least mean size of a component: what is said seldom counts more [-]
+_PAST = 0.15  # how far past its limit a change is said: small errors do not open closed jaws [-]
 _LAST = 50  # steps of the optimiser that the error is a mean of
 _KNOWN = 0.05  # share of `_VARY` that is enough where lessons have shown the whole
 _REHEARSING, _CAREFUL = 5, 0.2  # steps an iteration, learning rate over that of practice
@@ -64,6 +65,7 @@ class Networks:
     groups: names of what is observed by group
     initial_action: what counts as the last action when an episode begins  (naction,)
     lessons: how many it was taught
+    updates: steps of the optimiser that a round of them is learned in
   """
 
   def __init__(
@@ -95,6 +97,7 @@ class Networks:
     """
     torch.manual_seed(seed)
     self.groups, self.device, self.lessons = grouped(list(shapes), taught, privileged), device, 0
+    self.updates = CLONING
     self._shapes: dict[str, tuple[int, ...]] = dict(shapes)
     self._memory: Any = None
     self._components = list(components)
@@ -205,9 +208,9 @@ class Networks:
     self.remember(lessons)
     parameters = [*self._parts(), *self.critic.mlp.parameters()]
     optimiser = torch.optim.Adam(parameters, lr=_RATE)
-    falling = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=CLONING)
+    falling = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=self.updates)
     losses = []
-    for _ in range(CLONING):
+    for _ in range(self.updates):
       if (share := spent()) >= 1.0:
         break
       some = self._some()
@@ -218,7 +221,7 @@ class Networks:
       both.backward()
       torch.nn.utils.clip_grad_norm_(parameters, 1.0)
       optimiser.step()
-      falling.last_epoch = min(max(falling.last_epoch, int(share * CLONING)), CLONING - 1)
+      falling.last_epoch = min(max(falling.last_epoch, int(share * self.updates)), self.updates - 1)
       falling.step()
       losses.append(loss.detach())
     return float(torch.stack(losses[-_LAST:]).mean()) if losses else math.nan
@@ -231,6 +234,8 @@ class Networks:
     every = torch.cat([each["seen"] for each in self._memory])
     self.normalise(every)
     self.weigh(torch.cat([each["says"][each["taught"] > 0] for each in self._memory]))
+    for each in self._memory:
+      each["says"] += _PAST * each["limit"]
 
   def weigh(self, says: torch.Tensor) -> None:
     """Learns how much each component of what is to be said varies  (n, naction)."""
@@ -249,6 +254,7 @@ class Networks:
     rows = {
       "seen": TensorDict(groups, batch_size=[count]),
       "says": says.sign() * says.abs() ** (1.0 / POWER),
+      "limit": self._adds.cpu() * meant.sign() * (meant.abs() >= 1.0),
       "taught": torch.from_numpy(lesson.taught).float(),
       "returns": torch.from_numpy(lesson.returns),
       "present": torch.ones(count),

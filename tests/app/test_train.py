@@ -185,6 +185,26 @@ def test_what_is_held_from_the_start_is_no_change_to_learn(monkeypatch):
   assert learned.begin()({"target": seen[0]})[1] == pytest.approx(0.5, abs=0.05)
 
 
+def test_jaws_that_are_closed_are_said_past_their_limit():
+  names, count, half = ("pitch", "jaw"), 40, 20
+  task = SimpleNamespace(name="any/easy", components=names, control_timestep=0.02)
+  made = networks.Networks({"target": (3,)}, names, 8, (8,), 0.1, 0, "cpu")
+  made.updates = 200
+  seen = np.zeros((count, 3), np.float32)
+  seen[half:] = 1.0
+  done = np.zeros((count, 2), np.float32)
+  done[half:, 1] = -1.0  # they close at once, and stay so
+  taught = np.arange(count) != half
+  made.learn(2 * [Lesson(seen, done, done, taught, seen[:, 0], "success", False)])
+  act = made.policy(task, {}, {}).begin()
+  changes = []
+  for row in seen:
+    act.last[:] = 0.0
+    changes.append(act({"target": row})[1])
+  assert abs(changes[half - 1]) < 0.005
+  assert -0.1 < changes[-1] < -0.01
+
+
 def test_the_learning_rate_falls_in_the_time_there_is(monkeypatch):
   monkeypatch.setattr(networks, "CLONING", 700)
   random = np.random.RandomState(0)

@@ -54,6 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser):
     "--lessons", metavar="N", type=int, default=_LESSONS,
     help=f"of an expert, in each of {ROUNDS} rounds at most (%(default)s); 0 for practice alone",
   )  # fmt: skip
+  add("--updates", metavar="N", type=int, help="of the networks, after each round (700)")
   add(
     "--teacher", metavar="FILE", default=_TRAINED,
     help="of a policy of pictures: the policy of the state that it learns from (%(default)s)",
@@ -79,8 +80,7 @@ def main(args: argparse.Namespace) -> int:
   for count in ("iterations", "lessons"):
     if getattr(args, count) < 0:
       raise CommandError(f"{count} is {getattr(args, count)}, expected a whole number >= 0")
-  if args.num_envs is not None:
-    check_counts(args, "num_envs")
+  check_counts(args, *(name for name in ("num_envs", "updates") if getattr(args, name) is not None))
   if not args.minutes > 0:
     raise CommandError(f"minutes is {args.minutes:g}, expected a number > 0")
   crew = workers.chosen(args)
@@ -136,6 +136,7 @@ class Training:
       self.settings.memory, self.settings.hidden, self.settings.spread, args.seed, device, taught,
       privileged, self.task.initial_action,
     )  # fmt: skip
+    self.networks.updates = args.updates or self.networks.updates
     if self.school.rounds:
       self.networks.remember(self.school.lessons)
     start = folder / policy.FILE if self.school.rounds else args.start
