@@ -29,7 +29,8 @@ _OTHERS = 1_000_000  # seed of the first of many worlds
 def arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   add = parser.add_argument
-  add("--policies", metavar="FOLDER", default=str(policy.FOLDER), help="those that ship")
+  add("--policies", metavar="FOLDER", type=pathlib.Path, default=policy.FOLDER,
+      help="those that ship")  # fmt: skip
   add("--worlds", metavar="N", type=int, default=0, help="side by side, besides")
   add("--tasks", nargs="+", metavar="TASK", choices=NAMES, default=NAMES)
 
@@ -39,7 +40,7 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   cases, count = [], 1 if args.short else _EPISODES
   for start in range(0, count, _BLOCK):
     for name in args.tasks:
-      file = pathlib.Path(args.policies).resolve() / f"{name.replace('/', '_')}{policy.SUFFIX}"
+      file = args.policies.resolve() / f"{name.replace('/', '_')}{policy.SUFFIX}"
       if file.exists():
         case = {"case": f"{name}, from {start}", "task": name, "file": str(file), "start": start}
         cases.append(case | {"end": min(start + _BLOCK, count)})
