@@ -1,12 +1,13 @@
-"""The scene of `cut` and `drive`: a sheet of tissue in a frame.
+"""The scene of `cut`, `drive` and `running`: a sheet of tissue in a frame.
 
-World: z is up, the sheet lies in z = 0 and is held along its four sides.
+World: z is up, the sheet lies in z = 0, or over an organ, and is held along its four sides.
 """
 
 import mujoco
 import numpy as np
 import palpate
-from palpate.models import catalog, mjcf, scenery, situs
+from palpate.models import catalog, mjcf, scenery, shapes, situs
+from palpate.models.meshing import field
 
 from ..core import scenes
 from ..core.scenes import Scene
@@ -21,6 +22,7 @@ _TISSUE |= {"damping": 0.005, "foundation": 1e6}
 _MASS, _SKIN = 0.006, 0.0005  # [kg], radius of the flex [m]
 # What lies around: the wall, and fat of its own; ours.
 _HELD = situs.Arrangement(without=(*catalog.DUCTS, "fat"))
+_LOWERED = 30  # times that a sheet is lowered onto an organ
 _COLOUR, _FRAME = (0.87, 0.62, 0.52, 1.0), "0.55 0.58 0.62"
 
 
@@ -84,6 +86,25 @@ def slit(
   return np.concatenate([vertices, vertices[lips]]), triangles, np.stack([lips, other[lips]], 1)
 
 
+def laid_over(vertices: np.ndarray, organ: str, landmark: str) -> np.ndarray:
+  """Returns a flat sheet with the relief of an organ around a landmark, the middle in the origin.
+
+  The sheet's z is the normal there, its y goes up the organ.
+  """
+  shape = shapes.anatomy(organ)
+  at, ahead = shape.implicit, 1e-4 * np.eye(3)
+  place = field.project(at, shape.landmarks[landmark][None])
+  normal = at(place + ahead) - at(place - ahead)
+  normal /= np.linalg.norm(normal)
+  across = np.cross([0.0, 0.0, 1.0], normal)
+  across /= np.linalg.norm(across)
+  points = place + vertices[:, :2] @ [across, np.cross(normal, across)]
+  high = np.zeros(len(points))
+  for _ in range(_LOWERED):  # by no more than the distance from it
+    high -= at(points + high[:, None] * normal)
+  return np.column_stack([vertices[:, :2], high])
+
+
 def stretched(
   scene: Scene,
   tissue: dict,
@@ -91,6 +112,7 @@ def stretched(
   spare: float = 0.0,
   slots: int | None = None,
   span: tuple[float, float] | None = None,
+  over: tuple[str, str] | None = None,
 ) -> mujoco.MjSpec:
   """Returns a sheet in its frame, with instruments, light and what is around.
 
@@ -101,28 +123,32 @@ def stretched(
     spare: room for a cut, times the square root of the nodes
     slots: of the window, see `scenes.furnish`
     span: of a slit, see `slit`; None for none [m]
+    over: organ and landmark whose relief it has, see `laid_over`; None for a flat one
   """
   vertices, triangles = sheet(scene.nodes)
   if span:
     vertices, triangles, _ = slit(vertices, triangles, span)
+  rim = np.flatnonzero(np.abs(vertices).max(axis=1) > SIZE / 2 - 1e-6)
+  if over:
+    vertices = laid_over(vertices, *over)
   config = tissue | {"device": "cpu", "tolerance": scenes.TOLERANCE}
   flex = mjcf.flexcomp(
     scenes.ORGAN,
     (vertices, triangles),
     config=config,
     contact=scenes.CONTACT,
-    pin=np.flatnonzero(np.abs(vertices).max(axis=1) > SIZE / 2 - 1e-6),
+    pin=rim,
     digits=7,
     mass=mass,
     radius=_SKIN,
     rgba=_COLOUR,
   )
-  bars = _frame(seen=scene.surroundings != "abdomen")
+  bars = _frame(seen=scene.surroundings != "abdomen" and not over)
   spec = scenes.furnish(scene, flex, np.zeros(3), bars, slots)
   if spare:
     palpate.add_spare(spec, scenes.ORGAN, round(spare * np.sqrt(len(vertices))))
   if scene.surroundings == "abdomen":
-    situs.dress(spec, scenes.ORGAN, "wall", vertices[:, :2] / 0.15)
+    situs.dress(spec, scenes.ORGAN, over[0] if over else "wall", vertices[:, :2] / 0.15)
   lie_in_fat(spec, scene)
   return spec
 

@@ -39,6 +39,7 @@ AFTER |= {
   "suture/drive_hard": "suture/drive_standard",
   "suture/running_easy": "suture/drive_easy",
   "suture/running_standard": "suture/running_easy",
+  "suture/running_hard": "suture/running_standard",
   "suture/extracorporeal_easy": "touch/easy",
   "suture/extracorporeal_standard": "suture/extracorporeal_easy",
   "suture/extracorporeal_hard": "suture/extracorporeal_standard",

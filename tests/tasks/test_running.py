@@ -7,6 +7,7 @@ import pytest
 from palpate.models import wrist
 from palpate.tasks import suite
 from palpate.tasks.core import episode, performer, stage
+from palpate.tasks.domains import sheet
 from palpate.tasks.domains.suturing import running
 from palpate.tasks.recording import Recording
 
@@ -55,6 +56,17 @@ def test_an_organ_that_slept_is_awake_once_it_is_sewn(easy):
   mujoco.mj_step(made.model, data)
   assert not organ.asleep
   assert np.abs(organ.needles[0].force).max() > 0
+
+
+def test_a_sheet_over_the_stomach_has_its_relief():
+  flat, _ = sheet.sheet(480)
+  laid = sheet.laid_over(flat, "stomach", "body")
+  np.testing.assert_array_equal(laid[:, :2], flat[:, :2])
+  x, y = flat[:, :2].T
+  near = np.hypot(x, y) < 0.015
+  across, along = np.linalg.lstsq(flat[near, :2] ** 2 / 2, laid[near, 2], rcond=None)[0]
+  assert 0.035 < -1 / across < 0.05  # its tube is 43 mm thick there, see `shapes`
+  assert abs(along) < 0.2 * abs(across)
 
 
 def test_who_lets_go_has_missed(easy):

@@ -1,6 +1,6 @@
 """Running: close a cut with a running suture of four stitches, with two wristed needle drivers.
 
-A stretched wall has a cut of 25 mm, which gapes by 2 mm. Four
+A stretched wall has a cut of 25 mm, which gapes by 2 mm: a flat one, or that of a stomach. Four
 stitches are to close it, 6 mm apart and 4 mm from its edges, with one thread of polypropylene 3-0
 that ends in a bead. Some of them are placed already, but loose. The right hand drives the needle
 through the two marks of a stitch, the left one takes its tip and draws needle and thread through.
@@ -99,6 +99,7 @@ from .needles import (
 
 STITCHES, PITCH, BITE = 4, 0.006, 0.004  # [m]: between stitches, and from the edge of the cut
 TENSION = 40.0  # of the wall [N/m]
+_FILLING = 5e5  # foundation of the wall of a filled organ: its tension sinks it by 1 mm [Pa/m]
 _TOUGH = 1200.0  # as `TOUGH`: more, since stitches are pulled tight in it
 CUT = (-0.0135, 0.0075)  # vertices of the wall that the cut divides, along y [m]
 CLOSED, HELD = 0.001, 0.5  # gap of a cut that is closed [m], and how long it is to stay so [s]
@@ -134,6 +135,13 @@ def easy(**kwargs):
 def standard(**kwargs):
   """Place two of four stitches within 2 mm of their marks, and close the cut."""
   return Running(FIELD, **{"placed": 2, "tolerance": 0.002, "jitter": 0.002, **kwargs})
+
+
+@exercise("suture/running_hard", 150, "hard", "bimanual")
+def hard(**kwargs):
+  """Place three of them within 1.5 mm, in the wall of a stomach that is stretched more."""
+  kwargs = {"tension": 50.0, "over": ("stomach", "body"), **kwargs}
+  return Running(FIELD, **{"placed": 1, "tolerance": 0.0015, "jitter": 0.003, **kwargs})
 
 
 class State(Hands):
@@ -281,6 +289,7 @@ class Running(Stitching):
     tolerance: float,
     close: float = CLOSED,
     tension: float = TENSION,
+    over: tuple[str, str] | None = None,
     **kwargs,
   ):
     """Makes the task.
@@ -292,10 +301,11 @@ class Running(Stitching):
       tolerance: how far holes may be from their marks [m]
       close: gap that is closed [m]
       tension: of the wall [N/m]
+      over: organ and landmark whose wall it is, with its filling; None for a flat one
       **kwargs: see Task
     """
     self.placed, self.tolerance, self.close = placed, tolerance, close
-    self.tension = tension
+    self.tension, self.over = tension, over
     self.edges = sheet.slit(*sheet.sheet(kwargs.get("nodes") or scene.nodes), CUT)[2]
     self.pairs = len(self.edges)
     kwargs = {"force_limit": 3.0, "damage": 8.0, **kwargs}
@@ -304,7 +314,9 @@ class Running(Stitching):
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: a wall with a cut in a frame, and the needle with its thread."""
     tissue = WALL | {"needles": f"needle {_TOUGH:g} {FRICTION:g}", "tension": self.tension}
-    spec = sheet.stretched(self._scene(variant), tissue, _MASS, slots=_SLOTS, span=CUT)
+    tissue |= {"foundation": _FILLING} if self.over else {}
+    scene = self._scene(variant)
+    spec = sheet.stretched(scene, tissue, _MASS, slots=_SLOTS, span=CUT, over=self.over)
     spec.option.gravity = np.zeros(3)
     self.meet(spec)
     apart = np.array([0.1, 0.0, -0.05])  # until an episode begins

@@ -18,7 +18,7 @@ UNTOUCHED = {"hook_contact_force", "hook_peak_force"}
 # Searches, strokes, lines, rings and seams of 15 s and more are slow; most easy ones are not here.
 LONG = {"probe/palpate_standard", "probe/palpate_hard"}
 LONG |= {"needle/transfer_standard", "needle/transfer_hard"}  # the first in tests/tasks
-LONG |= {f"suture/running_{level}" for level in ("easy", "standard")}
+LONG |= {f"suture/running_{level}" for level in ("easy", "standard", "hard")}
 LONG |= {f"suture/extracorporeal_{level}" for level in ("standard", "hard")}
 LONG |= {
   f"{domain}/{task}" for domain in ("bimanual", "cut", "tease") for task in ("standard", "hard")

@@ -73,6 +73,7 @@ const GERMAN = {
   "drive a needle through two marks # mm apart, within # mm": "stich eine Nadel durch zwei Marken in # mm Abstand, auf # mm genau",
   "place the last of four stitches within # mm of its marks, and close the cut": "setze den letzten von vier Stichen auf # mm genau an seine Marken, und schließe den Schnitt",
   "place two of four stitches within # mm of their marks, and close the cut": "setze zwei von vier Stichen auf # mm genau an ihre Marken, und schließe den Schnitt",
+  "place three of them within # mm, in the wall of a stomach that is stretched more": "setze drei davon auf # mm genau, in der stärker gespannten Wand eines Magens",
   "drive it within # mm, in changing directions": "stich sie auf # mm genau, in wechselnden Richtungen",
   "drive it within # mm, as FLS asks for, through a tougher wall": "stich sie auf # mm genau, wie FLS es verlangt, durch eine zähere Wand",
   "push one throw down, and close the slit to # mm": "schiebe einen Wurf hinunter und schließe den Schlitz auf # mm",
