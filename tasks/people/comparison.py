@@ -17,7 +17,7 @@ from ..recording import Recording
 from . import page
 from .page import text
 from .plots import compared_figure, path_figure, png
-from .report import ending, verdict, views, write_page
+from .report import ending, points, verdict, views, write_page
 from .score import WEIGHTS, Score, score
 
 
@@ -109,14 +109,14 @@ def _task(entry: Entry) -> str:
 
 def _heads(measured: Sequence[_Measured]) -> list[tuple[str, list[str]]]:
   """Returns the rows above the metrics, in plain words."""
-  composite, proficient = [], []
+  proficient = []
   for m in measured:
-    composite.append("–" if m.score is None else number(round(m.score.composite, 2)))
     proficient.append("–" if m.score is None else "yes" if m.score.proficient else "no")
   rows = [("Task", [_task(m.entry) for m in measured])]
   rows.append(("Performer", [str(m.entry.recording.info.get("performer", "–")) for m in measured]))
   rows.append(("Outcome", [m.entry.recording.outcome or "not recorded" for m in measured]))
-  return [*rows, ("Score", composite), ("Proficient", proficient)]
+  scores = [points(m.score) for m in measured]
+  return [*rows, ("Score", scores), ("Proficient", proficient)]
 
 
 def _outcomes(measured: Sequence[_Measured]) -> str:
@@ -125,7 +125,7 @@ def _outcomes(measured: Sequence[_Measured]) -> str:
     outcome = m.entry.recording.outcome
     kind = "" if outcome is None else "good" if outcome == SUCCESS else "bad"
     cells = [text(m.entry.name), page.mark(text(ending(m.entry.recording)), kind)]
-    cells.append("–" if m.score is None else number(round(m.score.composite, 2)))
+    cells.append(points(m.score))
     cells.append("no reference" if m.score is None else text(verdict(m.score)))
     rows.append(page.row(cells, [2]))
   return page.table(["recording", "how it ended", "score", "proficiency"], rows, [2])

@@ -145,9 +145,8 @@ def _score_part(result: Score | None) -> str:
   if isinstance(result.composite, Unknown):
     head = f"<p><b>No composite score</b>: {text(result.composite.reason)}.</p>"
   else:
-    value = number(round(result.composite, 2))
-    kind = "good" if result.proficient else "bad"
-    head = f"<div class='score'><b>{value}</b>{page.mark(text(verdict(result)), kind)}</div>"
+    mark = page.mark(text(verdict(result)), "good" if result.proficient else "bad")
+    head = f"<div class='score'><b>{points(result)}</b>{mark}</div>"
   rows = []
   # What a failure did well on the way is no part of its score.
   for name, weight in WEIGHTS.items() if result.outcome == SUCCESS else ():
@@ -160,7 +159,7 @@ def _score_part(result: Score | None) -> str:
   categories = page.table(columns, rows, range(1, 5)) if rows else ""
   return (
     f"<h2>Score</h2>{head}{categories}<p class='small faint'>"
-    f"An exercise that did not succeed scores {number(FLOOR)}, below every success. Else the score "
+    f"An exercise that is not done counts as {number(FLOOR)}, below every success. Else the score "
     "is the weighted mean of the categories' mean z-scores. A z-score counts standard deviations "
     "of a panel of skilled people of many styles; positive beats their mean, whatever the metric's "
     "direction; it is clipped to ±10. Safety 67 % and efficiency 17 % are the weights of the "
@@ -170,6 +169,13 @@ def _score_part(result: Score | None) -> str:
     f"which {100 * PASSING:.0f} % of the panel are; a performer is proficient after {CONSECUTIVE} "
     f"such episodes in a row and {REPEATS} more (Ritter and Scott 2007).</p>"
   )
+
+
+def points(result: Score | None) -> str:
+  """Returns an episode's score for people: a failure has none."""
+  if result is None:
+    return "–"
+  return "not done" if result.composite == FLOOR else number(round(result.composite, 2))
 
 
 def verdict(result: Score) -> str:
@@ -313,4 +319,6 @@ def _plain(value: Any) -> str:
     return "; ".join(f"{k} = {_plain(v)}" for k, v in value.items())
   if isinstance(value, list | tuple):
     return ", ".join(map(_plain, value))
+  if isinstance(value, float):
+    return f"{value:.6g}"
   return "none" if value is None else str(value)
