@@ -19,7 +19,7 @@ axis = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
 
 spec = mujoco.MjSpec()
 spec.option.gravity = 0, 0, 0
-spec.visual.global_.offwidth, spec.visual.global_.offheight = 900, 900
+spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 1280
 spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.5] * 3, [0.7] * 3
 sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_GRADIENT}
 spec.add_texture(name="sky", width=64, height=64, rgb1=[1, 1, 1], rgb2=[0.85, 0.88, 0.9], **sky)
@@ -42,7 +42,7 @@ def picture(renderer: mujoco.Renderer, distance: float) -> np.ndarray:
   return renderer.render().copy()
 
 
-with mujoco.Renderer(model, 900, 900) as renderer:
+with mujoco.Renderer(model, 1280, 1280) as renderer:
   pictures = [picture(renderer, 0.012)]
   for k in range(130):
     pull = 0.5 * min(1.0, k / 50) * axis
@@ -50,5 +50,5 @@ with mujoco.Renderer(model, 900, 900) as renderer:
     mujoco.mj_step(model, data)
   pictures.append(picture(renderer, 0.0045))
 image = Image.fromarray(np.concatenate(pictures, axis=1))
-image = image.resize((900, 450), Image.Resampling.LANCZOS)
+image = image.resize((1280, 640), Image.Resampling.LANCZOS)
 image.save(pathlib.Path(__file__).parent / "pictures" / "knot.webp", quality=85)

@@ -19,7 +19,7 @@ from palpate.tasks import suite
 from palpate.tasks.core import performer, scenes
 
 PAGE = pathlib.Path(__file__).with_name("pixels.md")
-SIZE = 320  # [pixels]
+SIZE = 640  # [pixels]
 # Exercises, and for how long their experts act [s].
 SHOWN = {"grasp/easy": 4.0, "cut/easy": 8.0, "dissect/easy": 6.0, "trace/easy": 3.0}
 _NEAR = 1e-3  # of depth [m]

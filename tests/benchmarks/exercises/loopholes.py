@@ -336,6 +336,7 @@ def finding(rows: list[Row]) -> list[str]:
 
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
+  rows = [row for row in rows if row["status"] == "ok"]
 
   def number(row: Row, key: str) -> str:
     value = float(row[key])
