@@ -23,19 +23,19 @@ def load(**keys):
   data = mujoco.MjData(model)
   return model, data, palpate.Organ(model, data, "organ")
 """
-DRAG = """
-model, data, organ = load(drag=5.0)
+DAMPED = """
+model, data, organ = load(mass_damping=5.0)
 organ.set_state(organ.xpos, np.tile([0.1, 0.0, 0.0], (organ.nvert, 1)))
 mujoco.mj_step(model, data, 100)
 np.testing.assert_allclose(organ.xvel.mean(axis=0), [0.1 / 1.005**100, 0, 0], atol=1e-5)
-organ.configure(drag=0.0)
+organ.configure(mass_damping=0.0)
 before = organ.xvel.mean(axis=0)
 mujoco.mj_step(model, data, 100)
 np.testing.assert_allclose(organ.xvel.mean(axis=0), before, atol=1e-5)
 try:
-  load(drag=-1.0)
+  load(mass_damping=-1.0)
 except ValueError as error:
-  assert "drag is '-1', expected a number >= 0" in str(error), error
+  assert "mass_damping is '-1', expected a number >= 0" in str(error), error
 else:
   raise AssertionError("it was taken")
 """
@@ -73,8 +73,8 @@ ELASTIC = "-m", "pytest", "tests/tissue/test_elastic.py", "-q", "-x", "-p", "no:
 # Section of the page; what is run; files that may be forgotten, and what is said then.
 RECIPES = {
   "A configuration key": (
-    ("-c", FREE + DRAG),
-    {"plugin/tissue/types.py": "DRAG", "plugin/tissue/config.py": "drag"},
+    ("-c", FREE + DAMPED),
+    {"plugin/tissue/types.py": "MASS_DAMPING", "plugin/tissue/config.py": "mass_damping"},
   ),
   "An elastic energy of surfaces": (
     (*ELASTIC, "hardening"),
