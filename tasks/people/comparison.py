@@ -109,14 +109,12 @@ def _task(entry: Entry) -> str:
 
 def _heads(measured: Sequence[_Measured]) -> list[tuple[str, list[str]]]:
   """Returns the rows above the metrics, in plain words."""
-  proficient = []
-  for m in measured:
-    proficient.append("–" if m.score is None else "yes" if m.score.proficient else "no")
+  scores = [m.score for m in measured]
+  proficient = ["–" if s is None else "yes" if s.proficient else "no" for s in scores]
   rows = [("Task", [_task(m.entry) for m in measured])]
   rows.append(("Performer", [str(m.entry.recording.info.get("performer", "–")) for m in measured]))
   rows.append(("Outcome", [m.entry.recording.outcome or "not recorded" for m in measured]))
-  scores = [points(m.score) for m in measured]
-  return [*rows, ("Score", scores), ("Proficient", proficient)]
+  return [*rows, ("Score", list(map(points, scores))), ("Proficient", proficient)]
 
 
 def _outcomes(measured: Sequence[_Measured]) -> str:

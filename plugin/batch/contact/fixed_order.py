@@ -3,8 +3,8 @@
 mujoco_warp's threads ask for contacts and constraint rows, which are placed as they come, and add
 up over them by atomics. Here contacts and rows are put in an order that depends on the state alone,
 and the few sums over them are taken in it: J^T f and J^T D J of rows that are spread over all dofs.
-Warp's own deterministic mode, which mujoco_warp has for all of
-its sums, writes down every addend of every kernel and sorts them all.
+Warp's own deterministic mode, which mujoco_warp has for all of its sums, writes down every addend
+of every kernel and sorts them all.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
