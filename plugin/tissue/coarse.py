@@ -316,9 +316,9 @@ def threshold(device) -> float:
 def pay(part: dict, scale: float, threshold: float) -> bool:
   """Returns whether cycles take less time than block Jacobi at the time step of `scale`.
 
-  Not on a membrane: contact moves it where it is touched, and block Jacobi takes at most ten times
-  the cycles, warm half of that, from 678 to 262,146 nodes and from 3 kPa to 3 MPa
-  (results/development/preconditioner.md), while a cycle takes as long as eight iterations and more.
+  Not on a membrane: contact moves it where it is touched, and block Jacobi takes about ten times
+  the cycles, warm half of that, from 678 to 262,146 nodes and from 3 kPa to 3 MPa, while a cycle
+  takes as long as eight iterations and more.
 
   Args:
     part: fields of the mesh, see `shape.arrays`
