@@ -1,5 +1,7 @@
 """What all tests share."""
 
+import sys
+
 import palpate  # noqa: F401 - before MuJoCo is imported: it chooses how to draw
 import pytest
 import scenes as builders
@@ -22,6 +24,24 @@ def pytest_collection_modifyitems(config, items):
 @pytest.fixture(scope="session")
 def scenes():
   return builders
+
+
+@pytest.fixture(scope="session")
+def can_render():
+  """Skips where nothing can draw."""
+  import mujoco
+
+  try:
+    mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
+  except Exception as error:
+    pytest.skip(f"no OpenGL here: {error}")
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+  """Works in an empty folder; it and the path of modules are as they were afterwards."""
+  monkeypatch.chdir(tmp_path)
+  monkeypatch.setattr(sys, "path", sys.path.copy())
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=needs_cuda)])

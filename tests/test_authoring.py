@@ -6,6 +6,7 @@ import palpate
 import pytest
 import trimesh
 from palpate.models import mjcf
+from scenes import load
 
 TISSUE = {"young": 8e3, "foundation": 1e5, "bulk": 2e4, "damping": 0.05, "device": "cpu"}
 BALL = trimesh.creation.icosphere(3, 0.04)
@@ -19,12 +20,6 @@ def world(height=0.0485):
     <worldbody><body name="shelf" pos="0 0 .1" euler="0 0 30"/>
       <body name="tool" pos="0 0 {height}"><joint type="slide" axis="0 0 1"/>
         <geom size=".008" mass="{TOOL}"/></body></worldbody></mujoco>""")
-
-
-def load(spec, name="organ"):
-  model = spec.compile()
-  data = mujoco.MjData(model)
-  return model, data, palpate.Organ(model, data, name)
 
 
 @pytest.mark.parametrize("coupling", ["nodal", "window"])

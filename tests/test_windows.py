@@ -188,9 +188,7 @@ def test_organ_of_a_world_that_is_attached_in_a_turned_frame(coupling):
   world.attach(child, prefix="a/", frame=frame)
   if coupling == "window":
     palpate.add_windows(world, "a/organ")
-  m = world.compile()
-  d = mujoco.MjData(m)
-  organ = palpate.Organ(m, d, "a/organ")
+  m, d, organ = scenes.load(world, "a/organ")
   size = np.ptp(organ.xpos0, axis=0)
   np.testing.assert_allclose(size, [0.06, 0.02, 0.04], rtol=0.02)  # z is now along x
   organ.set_state(organ.xpos0 + np.array([0, 0.001, 0]))

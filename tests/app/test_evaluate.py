@@ -16,11 +16,7 @@ from palpate.tasks.recording import Recording
 
 QUICK = {"surroundings": "none", "nodes": 250}  # to load in another process
 
-
-@pytest.fixture(autouse=True)
-def _here(tmp_path, monkeypatch):
-  monkeypatch.chdir(tmp_path)
-  monkeypatch.setattr(sys, "path", sys.path.copy())
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def test_evaluate_prints_success_and_spread(capsys, tmp_path):

@@ -22,11 +22,7 @@ from palpate.tasks.recording import Recording
 
 EASY = ("exercise", "touch/easy", "--no-report")
 
-
-@pytest.fixture(autouse=True)
-def _here(tmp_path, monkeypatch):
-  monkeypatch.chdir(tmp_path)
-  monkeypatch.setattr(sys, "path", sys.path.copy())
+pytestmark = pytest.mark.usefixtures("here")
 
 
 @pytest.fixture

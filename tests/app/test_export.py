@@ -8,7 +8,6 @@ import pathlib
 import re
 import runpy
 import signal
-import sys
 
 import numpy as np
 import pytest
@@ -35,11 +34,7 @@ IDLE = "import numpy as np\ndef act(observation): return np.zeros(4)\n"
 def export(*words) -> int:
   return cli.main(["export", *map(str, words)])
 
-
-@pytest.fixture(autouse=True)
-def _here(tmp_path, monkeypatch):
-  monkeypatch.chdir(tmp_path)
-  monkeypatch.setattr(sys, "path", sys.path.copy())
+pytestmark = pytest.mark.usefixtures("here")
 
 
 @pytest.fixture(scope="module")

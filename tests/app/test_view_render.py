@@ -23,13 +23,7 @@ def _here(tmp_path, monkeypatch):
   monkeypatch.delenv("DISPLAY", raising=False)
   monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 
-
-@pytest.fixture(scope="module", autouse=True)
-def _can_render():
-  try:
-    mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
-  except Exception as error:
-    pytest.skip(f"no OpenGL here: {error}")
+pytestmark = pytest.mark.usefixtures("can_render")
 
 
 def _render(*words: str) -> np.ndarray:

@@ -65,7 +65,7 @@ def test_a_step_with_a_copy_of_the_model_reads_nothing_of_the_first(make, speed)
     assert np.abs(organ.displacement).max() > 1e-5
 
 
-def test_organs_bonded_to_each_other_from_both_sides_break_and_are_copied():
+def test_organs_bonded_to_each_other_from_both_sides_break_and_are_copied(scenes):
   model = bonded(below=f"upper {BONDS}")
   data = thrown(model, 1.0)
   lower, upper = organs(model, data)
@@ -76,10 +76,8 @@ def test_organs_bonded_to_each_other_from_both_sides_break_and_are_copied():
     if upper.bonds.damage.any():
       break
   assert upper.bonds.share_freed < 1
-  state = np.empty(mujoco.mj_stateSize(model, STATE))
-  mujoco.mj_getState(model, data, state, STATE)
   twins = [copy.copy(data), mujoco.MjData(model)]
-  mujoco.mj_setState(model, twins[1], state, STATE)
+  mujoco.mj_setState(model, twins[1], scenes.state(model, data), STATE)
   for each in (data, *twins):
     mujoco.mj_step(model, each, 20)
   assert upper.bonds.share_freed > 0 and upper.error is None and lower.error is None

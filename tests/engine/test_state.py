@@ -143,9 +143,7 @@ def test_an_organ_attached_with_a_prefix(scenes):
   parent = mujoco.MjSpec.from_string(scenes.world(gravity=GRAVITY))
   frame = parent.worldbody.add_frame(pos=[0.1, 0.2, 0.3], euler=[0.3, 0, 0])
   parent.attach(child, prefix="left/", frame=frame)
-  model = parent.compile()
-  data = mujoco.MjData(model)
-  organ = palpate.Organ(model, data, "left/organ")
+  model, data, organ = scenes.load(parent, "left/organ")
   scenes.run(model, data, 300)
   assert organ.displacement.std(axis=0).max() < 1e-3
   assert 1e-6 < np.abs(organ.displacement).max() < 0.05

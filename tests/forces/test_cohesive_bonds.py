@@ -266,12 +266,10 @@ def _pull(model, data, steps, speed=0.02):
     mujoco.mj_step(model, data)
 
 
-def test_states_and_copies_go_on_to_the_bit_and_a_reset_heals(make):
+def test_states_and_copies_go_on_to_the_bit_and_a_reset_heals(scenes, make):
   model, data, organ, _ = _torn(make)
   _pull(model, data, 250)
-  kind = mujoco.mjtState.mjSTATE_INTEGRATION
-  state = np.zeros(mujoco.mj_stateSize(model, kind))
-  mujoco.mj_getState(model, data, state, kind)
+  state = scenes.state(model, data)
   torn = organ.bonds.damage
   assert 0 < (torn > 0).sum() and 0 < organ.bonds.energy
   other = copy.copy(data)
@@ -280,7 +278,7 @@ def test_states_and_copies_go_on_to_the_bit_and_a_reset_heals(make):
     _pull(model, each, 100)
     found = palpate.Organ(model, each, "organ").bonds
     ends.append([found.damage, found.released, found.force])
-  mujoco.mj_setState(model, data, state, kind)
+  mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
   np.testing.assert_array_equal(organ.bonds.damage, torn)
   _pull(model, data, 100)
   ends.append([organ.bonds.damage, organ.bonds.released, organ.bonds.force])

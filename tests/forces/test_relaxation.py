@@ -65,13 +65,11 @@ def test_relaxation_hardly_depends_on_the_time_step(scenes):
 def test_a_relaxing_organ_goes_on_to_the_bit_from_a_saved_state(scenes):
   model, data, organ, grip = _bar(scenes, "window")
   _pull(model, data, grip, 0.05)
-  kind = mujoco.mjtState.mjSTATE_INTEGRATION
-  state = np.zeros(mujoco.mj_stateSize(model, kind))
-  mujoco.mj_getState(model, data, state, kind)
+  state = scenes.state(model, data)
   for _ in range(20):
     mujoco.mj_step(model, data)
   expected = organ.xpos
-  mujoco.mj_setState(model, data, state, kind)
+  mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
   for _ in range(20):
     mujoco.mj_step(model, data)
   np.testing.assert_array_equal(organ.xpos, expected)

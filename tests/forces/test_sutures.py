@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
+from scenes import state
 from scenes.needles import (
   ENERGY,
   LENGTH,
@@ -32,11 +33,9 @@ def test_a_thread_slides_through_a_hole_as_around_a_capstan():
   drive(model, data, organ, [5.0])
   (hole,) = organ.pinholes
   assert hole.thread and hole.along < -8e-3
-  kind = mujoco.mjtState.mjSTATE_INTEGRATION
-  state = np.zeros(mujoco.mj_stateSize(model, kind))
-  mujoco.mj_getState(model, data, state, kind)
+  at = state(model, data)
   other = mujoco.MjData(model)
-  mujoco.mj_setState(model, other, state, kind)
+  mujoco.mj_setState(model, other, at, mujoco.mjtState.mjSTATE_INTEGRATION)
   for each in (data, other):
     mujoco.mj_step(model, each, 20)
   assert np.array_equal(data.qpos, other.qpos)

@@ -32,9 +32,7 @@ def scene(seed: int):
   spec.option.gravity = [0, 0, 0]
   palpate.add_organ(spec, mesh, "organ", windows=bool(random.randint(2)), elements="solid",
                     spare=500, mass=0.3, device="cpu", **keys)  # fmt: skip
-  model = spec.compile()
-  data = mujoco.MjData(model)
-  organ = palpate.Organ(model, data, "organ")
+  model, data, organ = scenes.load(spec)
   x = organ.xpos
   shape = np.sin(x @ random.normal(0, 20, (3, 3)) + 6 * random.rand(3))
   wave = 0.12 * np.ptp(x) * random.rand() ** 2

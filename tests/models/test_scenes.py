@@ -10,6 +10,7 @@ import pytest
 from palpate import models
 from palpate.models import catalog, measure, trocar
 from palpate.models.handle import Handle
+from scenes import load
 
 NAMES = models.NAMES
 CAMERAS = ["laparoscope", "overview", "side"]
@@ -92,9 +93,7 @@ def test_hidden_lump_is_felt():
 
 def test_a_grip_pulls_the_livers_edge_out():
   """The jaws close on the inferior tip and go back 12 mm: the tissue follows by 4 mm or more."""
-  model = models.load("liver", instruments=("grasper",)).compile()
-  data = mujoco.MjData(model)
-  organ = palpate.Organ(model, data, "liver/liver")
+  model, data, organ = load(models.load("liver", instruments=("grasper",)), "liver/liver")
   mujoco.mj_forward(model, data)
   target = data.site("liver/liver_inferior_tip").xpos.copy()
   normal = measure.surface_normal(organ, target)

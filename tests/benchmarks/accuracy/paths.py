@@ -79,9 +79,7 @@ def measure(shape: str, curve: str, nodes: int, seed: int) -> Row:
   spec.option.gravity = (0, 0, 0)
   palpate.add_organ(spec, surface(shape, nodes, seed), "organ", windows=True, mass=0.05, young=2e5,
                     thickness=THICKNESS, spare="auto", device="cpu")  # fmt: skip
-  model = spec.compile()
-  data = mujoco.MjData(model)
-  organ = palpate.Organ(model, data, "organ")
+  model, data, organ = scenes.load(spec)
   mujoco.mj_step(model, data)
   points = path_of(shape, curve, seed)
   (before,) = organ.pieces

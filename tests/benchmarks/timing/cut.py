@@ -92,9 +92,7 @@ def scene(nodes: int, tool: str, tissue: str):
     keys["spare"] = 900
   more |= {"windows": True, "pin": pin, "device": "cpu", **keys}
   palpate.add_organ(spec, (points, elem), "organ", **more)
-  model = spec.compile()
-  data = mujoco.MjData(model)
-  return model, data, palpate.Organ(model, data, "organ")
+  return scenes.load(spec)
 
 
 def _spent(work) -> float:

@@ -7,18 +7,12 @@ import numpy as np
 import palpate
 import pytest
 import scenes
-from devices import needs_cuda
 from palpate.tissue.config import Config
 from scipy.spatial import cKDTree
 
 FULL = mujoco.mjtState.mjSTATE_INTEGRATION
 SPARE = 120
 BOTH = pytest.mark.parametrize("windows", [False, True], ids=["nodal", "windows"])
-
-
-@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=needs_cuda)])
-def device(request) -> str:
-  return request.param
 
 
 def sphere():

@@ -179,9 +179,7 @@ def test_what_is_cut_off_rests_on_what_the_organ_rested_on(below):
     palpate.add_organ(spec, (points, elem), "lower", support="floor", **keys | {"thickness": 0.01})
   high = 0.002 * (below == "lower")
   palpate.add_organ(spec, (points + np.array([0, 0, high]), elem), "organ", support=below, **keys)
-  model = spec.compile()
-  data = mujoco.MjData(model)
-  organ = palpate.Organ(model, data, "organ")
+  model, data, organ = scenes.load(spec)
   mujoco.mj_step(model, data, 100)
   x = organ.xpos
   organ.cut([[0.04, -0.02, x[:, 2].mean()], [0.042, 0.02, x[:, 2].mean()]])
@@ -206,9 +204,7 @@ def test_a_motion_that_stays_on_the_device_is_cut_there(where):
   for resident in (False, True):
     each = spec.copy()
     palpate.add_organ(each, strip, "organ", resident=resident, device=where, **keys)
-    model = each.compile()
-    data = mujoco.MjData(model)
-    organ = palpate.Organ(model, data, "organ")
+    model, data, organ = scenes.load(each)
     for k in range(100):
       data.mocap_pos[0, 2] = 0.012 - 6e-5 * k
       mujoco.mj_step(model, data)
@@ -254,9 +250,7 @@ def test_jaws_take_away_what_was_cut_off_and_a_picture_shows_it():
   pin = np.flatnonzero(points[:, 0] < 0.03)
   keys = {"mass": 0.01, "young": 2e5, "thickness": 0.002, "damping": 0.02, "device": "cpu"}
   palpate.add_organ(spec, (points, elem), "organ", windows=True, pin=pin, spare=60, **keys)
-  model = spec.compile()
-  data = mujoco.MjData(model)
-  organ = palpate.Organ(model, data, "organ")
+  model, data, organ = scenes.load(spec)
 
   def hold(steps, height):
     data.ctrl[:] = height, -0.0085, -0.0085

@@ -7,18 +7,12 @@ import numpy as np
 import palpate
 import pytest
 import scenes
-from devices import needs_cuda
 from palpate.engine.cutting import cuts
 from scipy.spatial import cKDTree
 
 FULL = mujoco.mjtState.mjSTATE_INTEGRATION
 BOTH = pytest.mark.parametrize("windows", [False, True], ids=["nodal", "windows"])
 KEYS = {"elements": "solid", "mass": 0.3, "young": 1e4, "spare": 260}
-
-
-@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=needs_cuda)])
-def device(request) -> str:
-  return request.param
 
 
 def block():
@@ -34,9 +28,7 @@ def scene(mesh=None, windows=True, gravity=(0, 0, 0), h=2e-3, **keys):
   body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.006, 0, 0], mass=0.1)
   scenes.servo(spec, "z", 400, 10)
   palpate.add_organ(spec, mesh or block(), "organ", windows=windows, **KEYS | keys)
-  model = spec.compile()
-  data = mujoco.MjData(model)
-  return model, data, palpate.Organ(model, data, "organ")
+  return scenes.load(spec)
 
 
 def across(x=0.0, ends=0.025):

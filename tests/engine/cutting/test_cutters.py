@@ -40,9 +40,7 @@ def scene(windows=False, x=-0.004, z=0.0, add=scalpel, **keys):
   given = {"mass": 0.005, "young": 2e5, "thickness": THICKNESS, "spare": 60, "pin": pin}
   given |= {"cutters": f"edge {ENERGY}", "device": "cpu"}
   palpate.add_organ(spec, (points, elem), "organ", windows=windows, **given | keys)
-  model = spec.compile()
-  data = mujoco.MjData(model)
-  return model, data, palpate.Organ(model, data, "organ")
+  return scenes.load(spec)
 
 
 @BOTH

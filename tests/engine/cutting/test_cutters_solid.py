@@ -29,9 +29,7 @@ def scene(windows=True, x=-0.033, z=0.01, half=0.006, young=5e5, cutters=f"edge 
   pin = np.flatnonzero(np.abs(np.abs(points[:, 1]) - 0.015) < 1e-9)
   given = {"mass": 0.05, "young": young, "spare": 300, "pin": pin, "cutters": cutters}
   palpate.add_organ(spec, (points, elem), windows=windows, elements="solid", device="cpu", **given)
-  model = spec.compile()
-  data = mujoco.MjData(model)
-  return model, data, palpate.Organ(model, data, "organ")
+  return scenes.load(spec)
 
 
 @pytest.mark.parametrize("deep", [0.006, 0.009])  # of 12 mm

@@ -43,10 +43,8 @@ def press(m, d, steps=60):
 
 
 @pytest.mark.parametrize("windows", [False, True])
-def test_a_dent_is_seen(windows):
-  m = scene(windows).compile()
-  d = mujoco.MjData(m)
-  organ = palpate.Organ(m, d, "organ")
+def test_a_dent_is_seen(scenes, windows):
+  m, d, organ = scenes.load(scene(windows))
   press(m, d)
   deep = organ.xpos0[:, 2] - organ.xpos[:, 2]
   assert deep.max() > 2e-3
@@ -121,9 +119,7 @@ def test_a_skin_has_the_triangles_that_are_declared_where_the_physics_turns_diag
   spec = mujoco.MjSpec()
   palpate.add_organ(spec, (points, triangles), "organ", young=5e3, mass=0.05, device="cpu")
   palpate.add_skin(spec, "organ", 1)
-  m = spec.compile()
-  d = mujoco.MjData(m)
-  organ = palpate.Organ(m, d, "organ")
+  m, d, organ = scenes.load(spec)
   assert (np.sort(organ.elem, axis=1) != np.sort(triangles, axis=1)).any()
   mujoco.mj_forward(m, d)
   np.testing.assert_allclose(drawn(m, d), subdivide.smooth(triangles, 1)(points), atol=1e-7)

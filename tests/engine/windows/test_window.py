@@ -17,14 +17,10 @@ from scenes import RADIUS, drive, goes_on, load, lump, organ, probed, sphere, wi
 @pytest.mark.parametrize(("condim", "steps"), [(1, 350), (3, 170), (4, 170), (6, 170)])
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_window_moves_as_nodal_dofs_do(condim, steps, cone):
-  m = mujoco.MjModel.from_xml_string(probed(False, condim=condim, cone=cone))
-  d = mujoco.MjData(m)
-  organ = palpate.Organ(m, d, "organ")
+  m, d, organ = load(probed(False, condim=condim, cone=cone))
   lump(organ)
   reference = drive(m, d, steps)
-  mw = mujoco.MjModel.from_xml_string(probed(condim=condim, cone=cone))
-  dw = mujoco.MjData(mw)
-  windowed = palpate.Organ(mw, dw, "organ")
+  mw, dw, windowed = load(probed(condim=condim, cone=cone))
   force = drive(mw, dw, steps)
   assert mw.nv < 0.4 * m.nv
   peak = np.abs(reference).max()
@@ -92,9 +88,7 @@ def test_two_steps_back_tell_where_the_solve_starts(window):
   """Without the dv before the last, the solve takes more iterations to the same motion."""
   forces, counts = [], []
   for forget in (False, True):
-    m = mujoco.MjModel.from_xml_string(probed(window=window, keys={"tolerance": 1e-5}))
-    d = mujoco.MjData(m)
-    organ = palpate.Organ(m, d, "organ")
+    m, d, organ = load(probed(window=window, keys={"tolerance": 1e-5}))
     if window:
       where = layout.spans(layout.Motion, {"nvert": organ.nvert})
     else:
@@ -123,9 +117,7 @@ def test_rotated_frame_gives_the_same_force():
 
 
 def test_far_tool_leaves_the_organ_at_rest_and_finds_it_after_a_jump():
-  m = mujoco.MjModel.from_xml_string(probed())
-  d = mujoco.MjData(m)
-  organ = palpate.Organ(m, d, "organ")
+  m, d, organ = load(probed())
   d.qpos[-2] = d.ctrl[0] = 0.5
   for _ in range(20):
     mujoco.mj_step(m, d)
@@ -154,9 +146,7 @@ def test_deformed_surface_reaches_the_renderer():
 
 
 def test_set_state_and_reset():
-  m = mujoco.MjModel.from_xml_string(probed())
-  d = mujoco.MjData(m)
-  organ = palpate.Organ(m, d, "organ")
+  _, _, organ = load(probed())
   moved = organ.xpos0 + np.array([0, 0, 0.001])
   organ.set_state(moved, np.ones_like(moved))
   np.testing.assert_allclose(organ.xpos, moved, atol=1e-12)

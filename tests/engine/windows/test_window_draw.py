@@ -11,7 +11,7 @@ import palpate
 import pytest
 from palpate.app import cli
 from palpate.app.press import figures
-from scenes import drive, probed
+from scenes import drive, load, probed
 
 CAMERA = '<camera name="side" pos="0 -.2 .12" xyaxes="1 0 0 0 .5 .9"/>'
 LIT = "<worldbody><light pos='.1 -.2 .3' dir='-.3 .5 -.8'/>" + CAMERA
@@ -80,9 +80,7 @@ def test_a_windowed_organ_looks_like_a_nodal_one(backend):
 
 
 def test_a_snapshot_brings_the_shape_back():
-  m = mujoco.MjModel.from_xml_string(probed())
-  d = mujoco.MjData(m)
-  organ = palpate.Organ(m, d, "organ")
+  m, d, organ = load(probed())
   drive(m, d, 110)
   kept, shape = figures.snapshot(m, d), organ.xpos
   assert np.abs(shape - organ.xpos0).max() > 1e-3
@@ -103,15 +101,7 @@ def test_a_snapshot_brings_the_shape_back():
   np.testing.assert_allclose(figures.frame(m, d, kept, Renderer()), shape, atol=1e-7)
 
 
-@pytest.fixture
-def _can_render():
-  try:
-    mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
-  except Exception as error:
-    pytest.skip(f"no OpenGL here: {error}")
-
-
-@pytest.mark.usefixtures("_can_render")
+@pytest.mark.usefixtures("can_render")
 def test_picture_of_a_press_with_a_window(tmp_path):
   imageio = pytest.importorskip("imageio.v3")
   images = []
@@ -123,7 +113,7 @@ def test_picture_of_a_press_with_a_window(tmp_path):
   assert np.abs(images[0] - images[1]).mean() < 0.3
 
 
-@pytest.mark.usefixtures("_can_render")
+@pytest.mark.usefixtures("can_render")
 def test_render_shows_edges_of_the_organ_alone(tmp_path):
   imageio = pytest.importorskip("imageio.v3")
   images = []

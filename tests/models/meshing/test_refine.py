@@ -84,12 +84,11 @@ def test_what_is_not_allowed_is_named(block, bad, match):
 
 def test_a_shipped_organ_is_finer_where_the_instruments_point():
   import mujoco
-  from palpate import Organ, models
+  import scenes
+  from palpate import models
 
   spec = models.load("kidney", coupling="window", interior="solid", fine=0.002)
-  model = spec.compile()
-  data = mujoco.MjData(model)
-  organ = Organ(model, data, "kidney/kidney")
+  model, data, organ = scenes.load(spec, "kidney/kidney")
   mujoco.mj_forward(model, data)
   assert 1000 < organ.nvert < 2000
   for place in ("anterior", "lower_pole"):
