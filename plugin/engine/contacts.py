@@ -16,7 +16,7 @@ from palpate.tissue.config import Config, rigidity
 from palpate.tissue.geometry.mesh import vertex_areas
 from palpate.tissue.kernels import kernel
 from palpate.tissue.solid import capsule
-from palpate.tissue.types import Array, doubles, ints, struct
+from palpate.tissue.types import Array, doubles, ints
 
 from . import coupling, safe_calls
 from .layout import FLAG, Numbers
@@ -68,7 +68,13 @@ _lifted: dict[int, np.ndarray] = {}  # by that, see `lifted`
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
 
-@struct
+@coupling.memory(
+  *("jacobian", "timestep", "impratio", "integrator", "solver", "noslip_iterations"),
+  *("enableflags", "body_dofadr", "body_dofnum", "body_parentid", "body_rootid", "dof_parentid"),
+  *("body_invweight0", "geom_bodyid", "geom_type", "geom_size", "flex_radius", "flex_margin"),
+  *("flex_dim", "flex_vertadr", "flex_vertbodyid", "flex_elem", "flex_elemdataadr", "qvel"),
+  *("flexvert_xpos", "geom_xpos", "geom_xmat", "subtree_com", "cdof", "plugin_state"),
+)
 class Weights:
   """The organs' flexes and MuJoCo's memory under its own names."""
 
@@ -82,39 +88,6 @@ class Weights:
   ngeom: int  # geoms of the model
   lifted: ints("nlifted")  # see `lifted`
   force_adr: ints("nflexvert")  # where the plugin state has a vertex' contact force, or -1
-  # mjOption:
-  jacobian: ints(1)
-  timestep: doubles(1)
-  impratio: doubles(1)
-  integrator: ints(1)
-  solver: ints(1)
-  noslip_iterations: ints(1)
-  enableflags: ints(1)
-  # mjModel:
-  body_dofadr: ints("nbody")
-  body_dofnum: ints("nbody")
-  body_parentid: ints("nbody")
-  body_rootid: ints("nbody")
-  dof_parentid: ints("nv")
-  body_invweight0: doubles("nbody", 2)
-  geom_bodyid: ints("ngeom")
-  geom_type: ints("ngeom")
-  geom_size: doubles("ngeom", 3)
-  flex_radius: doubles("nflex")
-  flex_margin: doubles("nflex")
-  flex_dim: ints("nflex")
-  flex_vertadr: ints("nflex")
-  flex_vertbodyid: ints("nflexvert")
-  flex_elem: ints("nflexelemdata")
-  flex_elemdataadr: ints("nflex")
-  # mjData:
-  qvel: doubles("nv")
-  flexvert_xpos: doubles("nflexvert", 3)
-  geom_xpos: doubles("ngeom", 3)
-  geom_xmat: doubles("ngeom", 9)
-  subtree_com: doubles("nbody", 3)
-  cdof: doubles("nv", 6)
-  plugin_state: doubles("npluginstate")
 
 
 def _offsets(prefix: str, kind, names) -> dict[str, int]:

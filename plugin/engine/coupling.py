@@ -9,6 +9,7 @@ then is a guess of what a tool meets, and follows the organ's answers.
 """
 
 # pyright: reportInvalidTypeForm=false
+import ctypes
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ import warp as wp
 from palpate.tissue import types
 from palpate.tissue.body import Body
 from palpate.tissue.kernels import Kernel, kernel
-from palpate.tissue.types import DIMS, doubles, floats, ints, scalar, struct, vector
+from palpate.tissue.types import DIMS, Array, floats, scalar, struct, vector
 
 from . import layout
 from .layout import NodalState, WindowState
@@ -129,38 +130,30 @@ class Phases:
     """Looks at the solution that was begun so, on `side`."""
 
 
-@struct
-class Mujoco:
-  """MuJoCo's own memory, under its own names."""
+def memory(*names: str) -> Callable[[type], Any]:
+  """Returns a decorator: a struct has MuJoCo's own memory under its own names as well.
 
-  timestep: doubles(1)
-  gravity: doubles(3)
-  disableflags: ints(1)
-  # mjModel:
-  qpos0: doubles("nq")
-  body_mass: doubles("nbody")
-  body_invweight0: doubles("nbody", 2)
-  dof_armature: doubles("nv")
-  dof_M0: doubles("nv")
-  dof_invweight0: doubles("nv")
-  geom_type: ints("ngeom")
-  geom_size: doubles("ngeom", 3)
-  geom_aabb: doubles("ngeom", 6)
-  geom_rbound: doubles("ngeom")
-  flex_elem: ints("nflexelemdata")
-  # mjData:
-  qpos: doubles("nq")
-  qvel: doubles("nv")
-  qfrc_applied: doubles("nv")
-  qfrc_passive: doubles("nv")
-  qfrc_constraint: doubles("nv")
-  xfrc_applied: doubles("nbody", 6)
-  geom_xpos: doubles("ngeom", 3)
-  geom_xmat: doubles("ngeom", 9)
-  body_awake: ints("nbody")
-  M: doubles("nC")
-  qLD: doubles("nC")
-  qLDiagInv: doubles("nv")
+  What type and shape that has MuJoCo says itself, see `mjstruct.declared`.
+  """
+  kinds = {ctypes.c_double: wp.float64, ctypes.c_int: wp.int32}
+
+  def made(cls: type) -> Any:
+    known = {name: mjstruct.declared(name) for name in names}
+    arrays = {name: Array(kinds[kind], shape) for name, (kind, shape) in known.items()}
+    cls.__annotations__ = cls.__annotations__ | arrays
+    return struct(cls)
+
+  return made
+
+
+@memory(
+  *("timestep", "gravity", "disableflags", "qpos0", "body_mass", "body_invweight0"),
+  *("dof_armature", "dof_M0", "dof_invweight0", "geom_type", "geom_size", "geom_aabb"),
+  *("geom_rbound", "flex_elem", "qpos", "qvel", "qfrc_applied", "qfrc_passive", "qfrc_constraint"),
+  *("xfrc_applied", "geom_xpos", "geom_xmat", "body_awake", "M", "qLD", "qLDiagInv"),
+)
+class Mujoco:
+  """What a coupling reads and writes of MuJoCo's own memory."""
 
 
 @struct

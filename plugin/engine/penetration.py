@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.tissue.kernels import kernel
-from palpate.tissue.types import doubles, ints, struct
+from palpate.tissue.types import doubles, ints
 
 from . import coupling
 from .layout import FLAG
@@ -100,7 +100,7 @@ def tools(m: mjstruct.Struct, organ: "Declaration") -> np.ndarray:
   return meets[(weld[body[meets]] != 0) & ~np.isin(body[meets], own)]
 
 
-@struct
+@coupling.memory("geom_bodyid", "body_rootid", "geom_xpos", "cvel", "subtree_com")
 class Speeds:
   """The tools of an organ, and what MuJoCo knows of their speed, under its own names."""
 
@@ -108,13 +108,6 @@ class Speeds:
   tool: ints("ntool")  # their geoms
   reach: doubles("ntool")  # of their points from their centres [m]
   flags: ints(len(FLAG))  # see FLAG
-  # mjModel:
-  geom_bodyid: ints("ngeom")
-  body_rootid: ints("nbody")
-  # mjData:
-  geom_xpos: doubles("ngeom", 3)
-  cvel: doubles("nbody", 6)
-  subtree_com: doubles("nbody", 3)
 
 
 find_fast = kernel("find_fast", "coupling/tools.h", Speeds, coupling.CONSTANTS | {"FAST": _FAST})

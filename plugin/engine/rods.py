@@ -110,7 +110,7 @@ class Rod:
   own: RodState
 
 
-@struct
+@coupling.memory(*_MUJOCOS)
 class Bound:
   """A rod and MuJoCo's arrays."""
 
@@ -126,18 +126,8 @@ class Bound:
   geom_tree: ints("ngeom")  # and a geom, -1 if it does not move
   frame: doubles(3, 3)  # rotation from the slides' axes to the world
   mj: Mujoco
-  # MuJoCo's memory under its own names; the mjData itself:
   nv: int
-  memory: Array(wp.uint64, ("nword",))
-  jacobian: ints(1)
-  flex_margin: doubles("nflex")
-  qvel: doubles("nv")
-  qacc: doubles("nv")
-  qacc_warmstart: doubles("nv")
-  qfrc_smooth: doubles("nv")
-  M_rowadr: ints("nv")
-  M_rownnz: ints("nv")
-  M_colind: ints("nC")
+  memory: Array(wp.uint64, ("nword",))  # the mjData itself
 
 
 CONSTANTS = contacts.CONSTANTS | {"CORE": CORE, "NEIGHBOURS": NEIGHBOURS, "GRIP": GRIP}

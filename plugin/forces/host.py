@@ -21,7 +21,7 @@ from palpate.tissue.order import LANES
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import DIMS, Array, doubles, fill, floats, ints, struct, vector
 
-from ..engine.coupling import CONSTANTS, Ties
+from ..engine.coupling import CONSTANTS, Ties, memory
 from ..engine.model import mjstruct
 
 if TYPE_CHECKING:
@@ -30,37 +30,14 @@ if TYPE_CHECKING:
 numbers = doubles("nnumber")  # of a tissue, see `NUMBERS`; in a batch a row a world
 
 
-@struct
+@memory(
+  *("timestep", "qpos0", "body_parentid", "body_rootid", "body_dofnum", "body_dofadr"),
+  *("geom_bodyid", "geom_type", "geom_size", "geom_aabb", "qpos", "qvel", "ctrl", "xpos"),
+  *("xmat", "cvel", "cdof", "qacc_warmstart", "subtree_com", "geom_xpos", "geom_xmat"),
+  *("qfrc_passive", "M", "M_rowadr", "M_rownnz", "qLD", "qLDiagInv"),
+)
 class Bodies:
-  """MuJoCo's own memory, under its own names."""
-
-  timestep: doubles(1)
-  qpos0: doubles("nq")
-  body_parentid: ints("nbody")
-  body_rootid: ints("nbody")
-  body_dofnum: ints("nbody")
-  body_dofadr: ints("nbody")
-  geom_bodyid: ints("ngeom")
-  geom_type: ints("ngeom")
-  geom_size: doubles("ngeom", 3)
-  geom_aabb: doubles("ngeom", 6)
-  qpos: doubles("nq")
-  qvel: doubles("nv")
-  ctrl: doubles("nu")
-  xpos: doubles("nbody", 3)
-  xmat: doubles("nbody", 9)
-  cvel: doubles("nbody", 6)
-  cdof: doubles("nv", 6)
-  qacc_warmstart: doubles("nv")
-  subtree_com: doubles("nbody", 3)
-  geom_xpos: doubles("ngeom", 3)
-  geom_xmat: doubles("ngeom", 9)
-  qfrc_passive: doubles("nv")
-  M: doubles("nC")
-  M_rowadr: ints("nv")
-  M_rownnz: ints("nv")
-  qLD: doubles("nC")
-  qLDiagInv: doubles("nv")
+  """What forces read and write of MuJoCo's own memory."""
 
 
 @struct

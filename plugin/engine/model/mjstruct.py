@@ -62,6 +62,23 @@ def _struct(name: str) -> type[C.Structure]:
   return type(declared.name, (C.Structure,), {"_fields_": fields})
 
 
+@functools.cache
+def declared(name: str) -> tuple[Any, tuple[int | str, ...]]:
+  """Returns type and shape of what mjOption, mjModel or mjData has under a name.
+
+  Of arrays the type is that of their numbers, and sizes are names of the model's.
+  """
+  every = (field for kind in _KINDS for field in structs.STRUCTS[kind].fields)
+  field = next(field for field in every if field.name == name)
+  kind: Any = field.type
+  if isinstance(kind, ast_nodes.PointerType):
+    return _ctype(kind.inner_type), tuple(field.array_extent or ())
+  if isinstance(kind, ast_nodes.ArrayType):
+    return _ctype(kind.inner_type), tuple(kind.extents)
+  return _ctype(kind), (1,)
+
+
+_KINDS = ("mjOption", "mjModel", "mjData")
 Struct = Any  # one of these, whose fields are known when MuJoCo is
 Model = _struct("mjModel")
 Data = _struct("mjData")
