@@ -6,11 +6,12 @@ import warp as wp
 from palpate.tissue.types import Array, doubles, floats, ints, struct
 
 from .patch import Patch
+from .private import theirs
 
 HELD = wp.constant(1.0 - 2.0**-24)  # the most damage that leaves a bond, in float32
 
 
-@struct
+@theirs(model="body_pos body_quat", data="qpos qvel geom_xpos geom_xmat")
 class Move:
   """Where joints and bodies of the worlds of a mask are put, and geoms before that."""
 
@@ -22,13 +23,6 @@ class Move:
   quat: Array(wp.quat, ("nworld",))  # its orientation there
   xpos: Array(wp.vec3, ("nworld", "ngeom"))  # of geoms [m]
   xmat: Array(wp.mat33, ("nworld", "ngeom"))
-  # mujoco_warp:
-  qpos: floats("nworld", "nq")
-  qvel: floats("nworld", "nv")
-  body_pos: Array(wp.vec3, ("nworld", "nbody"))
-  body_quat: Array(wp.quat, ("nworld", "nbody"))
-  geom_xpos: Array(wp.vec3, ("nworld", "ngeom"))
-  geom_xmat: Array(wp.mat33, ("nworld", "ngeom"))
 
 
 @wp.kernel(enable_backward=False)

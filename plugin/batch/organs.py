@@ -32,6 +32,7 @@ from .cutting.cuts import Cuts
 from .cutting.fracture import Cutters
 from .material import KEYS, Material
 from .patch import launch
+from .private import arrays_of
 from .strip_organs import Slots
 
 if TYPE_CHECKING:
@@ -119,12 +120,8 @@ class Organ(Tissue):
       overflow=batch.lost,
       bad=batch.bad,
       mask=batch.mask,
-      gravity=m.opt.gravity,
-      dof_armature=m.dof_armature,
-      body_invweight0=m.body_invweight0,
-      **{name: getattr(d, name) for name in (
-        "geom_xpos", "geom_xmat", "qpos", "qvel", "qfrc_passive", "qfrc_constraint")},
-    )  # fmt: skip
+      **arrays_of(patch.Patch, m, d),
+    )
     self._cuts = None
     if organ.mesh.spare:
       self._cuts = Cuts(self, values, surface)

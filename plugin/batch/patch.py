@@ -13,7 +13,9 @@ from palpate.engine.model import inertia, mjstruct
 from palpate.engine.windows import proxies
 from palpate.tissue import step
 from palpate.tissue.cutting.facets import World
-from palpate.tissue.types import Array, Tissue, doubles, fill, floats, ints, struct, vector, zeros
+from palpate.tissue.types import Array, Tissue, doubles, fill, floats, ints, vector, zeros
+
+from .private import theirs
 
 if TYPE_CHECKING:
   from palpate.engine.model.declare import Declaration
@@ -30,7 +32,11 @@ _OWN = (
 GRADES = 2.0 ** np.arange(-4, 5)
 
 
-@struct
+@theirs(
+  option="gravity",
+  model="dof_armature body_invweight0",
+  data="geom_xpos geom_xmat qpos qvel qfrc_passive qfrc_constraint",
+)
 class Patch:
   """An organ, the slots that stand for it in mujoco_warp, and what they share.
 
@@ -104,16 +110,6 @@ class Patch:
   overflow: ints("nworld")  # the most of these so far
   bad: ints("nworld")  # whether a number is not finite
   mask: Array(wp.bool, ("nworld",))  # worlds to reset
-  # mujoco_warp:
-  gravity: Array(wp.vec3, ("ngravity",))
-  geom_xpos: Array(wp.vec3, ("nworld", "ngeom"))
-  geom_xmat: Array(wp.mat33, ("nworld", "ngeom"))
-  qpos: floats("nworld", "nq")
-  qvel: floats("nworld", "nv")
-  qfrc_passive: floats("nworld", "nv")
-  qfrc_constraint: floats("nworld", "nv")
-  dof_armature: floats("nworld", "nv")
-  body_invweight0: Array(wp.vec2, ("nworld", "nbody"))
   tissue: Tissue
   solve: Crossing
 

@@ -15,6 +15,7 @@ from palpate.forces.cohesive_bonds import Bonds
 
 from . import kernels
 from .base import on_device
+from .private import arrays_of
 
 if TYPE_CHECKING:
   from .worlds import Worlds
@@ -63,10 +64,8 @@ class Rest:
       self.starts += [_start(array) for array in own]
     self._rows = self.starts + [_start(array) for array in zero if array.size]
     self._move = move = kernels.Move()
-    for name in kernels.Move.vars:
-      source = d if hasattr(d, name) else batch.m
-      if hasattr(source, name):
-        setattr(move, name, getattr(source, name))
+    for name, array in arrays_of(kernels.Move, batch.m, d).items():
+      setattr(move, name, array)
     move.mask, move.xpos, move.xmat = batch.mask, wp.clone(d.geom_xpos), wp.clone(d.geom_xmat)
 
   def launch(self):

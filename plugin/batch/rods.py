@@ -16,11 +16,11 @@ from palpate.engine import rods
 from palpate.engine.coupling import Ties
 from palpate.engine.rods import Rod
 from palpate.tissue.kernels import kernel
-from palpate.tissue.types import Array, doubles, fill, floats, ints, struct
+from palpate.tissue.types import Array, doubles, fill, floats, ints
 
-from . import base, host, kernels
+from . import base, kernels
 from .contact.contact_rows import Early, take_early
-from .private import vec5
+from .private import arrays_of, theirs
 
 if TYPE_CHECKING:
   from .worlds import Worlds
@@ -30,7 +30,14 @@ _BEYOND = 16
 _LANES = 32  # threads of a world
 
 
-@struct
+@theirs(
+  "contact_",
+  option="gravity",
+  model="M_rowadr M_rownnz M_colind",
+  data="qpos qvel qfrc_applied xfrc_applied qfrc_passive qfrc_smooth qacc qacc_warmstart M nefc",
+  contact="dim flex elem geom friction",
+  efc="type id J J_rownnz J_rowadr J_colind D aref",
+)
 class WorldRods:
   """A thread in all worlds, and mujoco_warp's arrays under their own names."""
 
@@ -55,36 +62,6 @@ class WorldRods:
   now: doubles("nworld", "nnode", 3)  # place in the slides' axes [m]
   speed: doubles("nworld", "nnode", 3)  # velocity [m/s]
   bad: ints("nworld")  # whether a number is not finite
-  # mujoco_warp's model:
-  gravity: Array(wp.vec3, ("nworld",))
-  M_rowadr: ints("nv")
-  M_rownnz: ints("nv")
-  M_colind: ints("nC")
-  # Its data:
-  qpos: floats("nworld", "nq")
-  qvel: floats("nworld", "nv")
-  qfrc_applied: floats("nworld", "nv")
-  xfrc_applied: floats("nworld", "nbody6")
-  qfrc_passive: floats("nworld", "nv")
-  qfrc_smooth: floats("nworld", "nv")
-  qacc: floats("nworld", "nv")
-  qacc_warmstart: floats("nworld", "nv")
-  M: floats("nworld", "nC")
-  nefc: ints("nworld")
-  contact_dim: ints("naconmax")
-  contact_flex: Array(wp.vec2i, ("naconmax",))
-  contact_elem: Array(wp.vec2i, ("naconmax",))
-  contact_geom: Array(wp.vec2i, ("naconmax",))
-  contact_friction: Array(vec5, ("naconmax",))
-  # Its rows of constraints:
-  type: ints("nworld", "njmax")
-  id: ints("nworld", "njmax")
-  J: floats("nworld", "nrow", "ncolumn")
-  J_rownnz: ints("nworld", "njmax")
-  J_rowadr: ints("nworld", "njmax")
-  J_colind: ints("nworld", "nrow", "ncolumn")
-  D: floats("nworld", "njmax")
-  aref: floats("nworld", "njmax")
 
 
 _CONSTANTS = rods.CONSTANTS | {"IS_CONTACT": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)}
@@ -155,18 +132,8 @@ class Thread(base.Thread):
       now=np.tile(organ.rest, (nworld, 1, 1)),
       speed=np.zeros((nworld, n, 3)),
       bad=batch.bad,
-      gravity=m.opt.gravity,
-      xfrc_applied=host.float_rows(d.xfrc_applied),
-      **{name: getattr(bare, name) for name in ("M_rowadr", "M_rownnz", "M_colind")},
-      **{
-        f"contact_{name}": getattr(d.contact, name)
-        for name in ("dim", "flex", "elem", "geom", "friction")
-      },
     )
-    for name in WorldRods.vars:
-      if name not in values:
-        values[name] = getattr(d if hasattr(d, name) else d.efc, name)
-    self.fields: Any = fill(WorldRods, device, values)
+    self.fields: Any = fill(WorldRods, device, arrays_of(WorldRods, m, d) | values)
     self._origin = wp.vec3(*organ.origin)
     springs = np.array([space.constants[name] for name in ("stretch", "length")])
     self._springs = wp.array(springs, dtype=wp.float64, device=device)
@@ -256,7 +223,7 @@ class Rods:
     self._batch = batch
     if not spaces:
       return
-    bare, contact = batch.bare, batch.d.contact
+    bare = batch.bare
     self._early = fill(Early, batch.device, dict(
       nthread=len(spaces),
       paired=int(batch.paired),
@@ -264,11 +231,7 @@ class Rods:
       discrete=int(bare.opt.integrator == getattr(mujoco.mjtIntegrator, "mjINT_DISCRETE", -1)),
       timestep=float(bare.opt.timestep),
       margin=bare.flex_margin[: len(spaces)],
-      nacon=batch.d.nacon,
-      aref=batch.d.efc.aref,
-      **{name: getattr(contact, name) for name in (
-        "dim", "flex", "worldid", "dist", "includemargin", "friction", "solref", "solimp",
-        "efc_address")},
+      **arrays_of(Early, batch.m, batch.d),
     ))  # fmt: skip
 
   def ties(self, flex: int) -> Ties:

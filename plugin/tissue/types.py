@@ -10,6 +10,7 @@ axis; `core/simd.h` says how they are read.
 import collections
 import dataclasses
 import enum
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,19 @@ def struct(cls) -> Any:
     name: wp.array(dtype=kind.dtype, ndim=len(kind.dims)) for name, kind in arrays.items()
   }
   return wp.struct(cls)
+
+
+def also(kind: Any, *names: str) -> Callable[[type], type]:
+  """Returns a decorator: a struct that is to be has some fields of another one as well."""
+  dims = DIMS[kind.key]
+
+  def made(cls: type) -> type:
+    for name in names:
+      own = kind.vars[name].type
+      cls.__annotations__[name] = Array(own.dtype, dims[name]) if name in dims else own
+    return cls
+
+  return made
 
 
 def tuple_of(kind: Any) -> Any:

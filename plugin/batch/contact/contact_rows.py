@@ -15,13 +15,12 @@ import numpy as np
 import warp as wp
 from palpate.engine import contacts, coupling
 from palpate.engine.contacts import TISSUE
-from palpate.engine.layout import GEOM
 from palpate.engine.model import mjstruct
 from palpate.tissue.kernels import kernel
-from palpate.tissue.types import Array, doubles, floats, ints, struct
+from palpate.tissue.types import Array, also, doubles, floats, ints
 
-from ..patch import launch
-from ..private import contact_kbimp, vec5
+from ..patch import Patch, launch
+from ..private import arrays_of, contact_kbimp, theirs, vec5
 
 if TYPE_CHECKING:
   from ..organs import Organ
@@ -33,10 +32,14 @@ _SMALL = tuple(int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
 # What of these fields are those of `Patch`.
 _OF_PATCH = ("nnode", "nslice", "nslot", "ntool", "ngeom", "mesh", "rest", "force", "slot_node",
              "tool", "tool_geom", "geom_xpos", "geom_xmat")  # fmt: skip
-_OF_CONTACT = ("dim", "dist", "pos", "frame", "friction", "solref", "solimp", "elem", "efc_address")
 
 
-@struct
+@theirs(
+  model="flex_elem",
+  contact="dim dist pos frame friction solref solimp elem efc_address",
+  efc="aref D",
+)
+@also(Patch, *_OF_PATCH)
 class Pressed:
   """An organ's contacts in mujoco_warp's arrays, and what is told of them."""
 
@@ -45,17 +48,7 @@ class Pressed:
   start: ints(1)  # the organ's first contact
   before: ints("nworld")  # its contacts in the worlds before
   count: ints("nworld")  # its contacts
-  dim: ints("naconmax")  # rows of a contact, or pairs of them and one
   contact_geom: Array(wp.vec2i, ("naconmax",))
-  dist: floats("naconmax")  # gap [m]
-  pos: Array(wp.vec3, ("naconmax",))
-  frame: Array(wp.mat33, ("naconmax",))
-  friction: Array(vec5, ("naconmax",))
-  solref: Array(wp.vec2, ("naconmax",))
-  solimp: Array(vec5, ("naconmax",))
-  elem: Array(wp.vec2i, ("naconmax",))
-  efc_address: ints("naconmax", "nrow")  # -1 for none
-  aref: floats("nworld", "njmax")  # reference acceleration of the rows [m/s^2]
   disableflags: int  # of mjOption
   discrete: int  # whether the integrator is
   timestep: float  # [s]
@@ -66,24 +59,9 @@ class Pressed:
   yields: int  # whether there is a tool that is small and round or flat, on tissue that yields so
   tool_of: ints("ngeom")  # which of the organ's tools a geom is, -1 for none
   yields_by: Array(wp.vec3, ("naconmax",))  # of a contact: `Stiff` [m/N], what is off its gap [m]
-  flex_elem: ints("nflexelemdata")  # slots of a triangle
-  elemadr: int  # where those of the organ begin
+  elemadr: int  # where the slots of its triangles begin in `flex_elem`
   radius: float  # of its flex [m]
   disp: floats("nworld", "nslice", 3, 8)  # displacement [m]
-  nnode: int
-  nslice: int
-  nslot: int
-  ntool: int
-  ngeom: int
-  mesh: ints("nworld")
-  rest: doubles("nmesh", "nnode", 3)
-  force: floats("nworld", "nnode", 3)
-  slot_node: ints("nworld", "nslot")
-  tool: doubles("nworld", "ntool", len(GEOM))
-  tool_geom: ints("ntool")
-  geom_xpos: Array(wp.vec3, ("nworld", "ngeom"))
-  geom_xmat: Array(wp.mat33, ("nworld", "ngeom"))
-  D: floats("nworld", "njmax")  # inverse of the rows' R [kg]
   row_force: floats("nworld", "njmax")  # force of the rows [N]
   # See `Contacts`:
   geom: ints("nworld", "many")
@@ -219,7 +197,11 @@ def press(p: Pressed):
   p.pressed[world, k] = total
 
 
-@struct
+@theirs(
+  data="nacon",
+  contact="dim flex worldid dist includemargin friction solref solimp efc_address",
+  efc="aref",
+)
 class Early:
   """Contacts of threads in mujoco_warp's arrays, which are there before they touch."""
 
@@ -229,17 +211,6 @@ class Early:
   discrete: int  # whether the integrator is
   timestep: float  # [s]
   margin: floats("nthread")  # of each thread [m]
-  nacon: ints(1)
-  dim: ints("naconmax")
-  flex: Array(wp.vec2i, ("naconmax",))
-  worldid: ints("naconmax")
-  dist: floats("naconmax")
-  includemargin: floats("naconmax")
-  friction: Array(vec5, ("naconmax",))
-  solref: Array(wp.vec2, ("naconmax",))
-  solimp: Array(vec5, ("naconmax",))
-  efc_address: ints("naconmax", "nrow")
-  aref: floats("nworld", "njmax")
 
 
 @wp.kernel(enable_backward=False)
@@ -281,11 +252,11 @@ def make(organ: "Organ", model: mujoco.MjModel, touch):
   out, d, bare, device = Pressed(), batch.d, batch.bare, batch.device
   out.many, out.paired = touch.most, int(batch.paired)
   out.start, out.before, out.count = touch.start, touch.before, touch.count
-  for name in _OF_CONTACT:
-    setattr(out, name, getattr(d.contact, name))
+  for name, array in arrays_of(Pressed, batch.m, d).items():
+    setattr(out, name, array)
   for name in _OF_PATCH:
     setattr(out, name, getattr(patch, name))
-  out.D, out.pairs = d.efc.D, 2.0 / float(model.opt.impratio)
+  out.pairs = 2.0 / float(model.opt.impratio)
   out.disableflags, out.timestep = bare.opt.disableflags, float(bare.opt.timestep)
   out.discrete = int(bare.opt.integrator == getattr(mujoco.mjtIntegrator, "mjINT_DISCRETE", -1))
   tissue = contacts.tissue_of(mjstruct.Model.from_address(model._address), organ.declared)
@@ -299,9 +270,9 @@ def make(organ: "Organ", model: mujoco.MjModel, touch):
   out.yields = int(tissue[TISSUE.modulus] + tissue[TISSUE.bearing] > 0 and small)
   out.tool_of = wp.array(tool_of, dtype=int, device=device)
   out.yields_by = wp.zeros(d.contact.dist.shape[0], dtype=wp.vec3, device=device)
-  out.flex_elem, out.elemadr = batch.m.flex_elem, int(bare.flex_elemdataadr[place.flex])
+  out.elemadr = int(bare.flex_elemdataadr[place.flex])
   out.radius, out.disp = touch.radius, patch.solve.disp
-  out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force
+  out.contact_geom, out.row_force = d.contact.geom, d.efc.force
   shape = (batch.nworld, out.many)
   out.geom, out.normal, out.pressed = (
     wp.zeros(shape, dtype=kind, device=device) for kind in (int, wp.vec3, float)

@@ -17,12 +17,12 @@ import warp as wp
 # All that depends on names inside of mujoco_warp: its tools against a triangle, and types.
 from palpate.engine import contacts
 from palpate.engine.model import mjstruct
-from palpate.tissue.types import Array, fill, floats, ints, struct
+from palpate.tissue.types import Array, fill, floats, ints
 
 from .. import private
 from ..kernels import triple
 from ..patch import Patch, halves
-from ..private import ContactType, vec5
+from ..private import ContactType, arrays_of, theirs, vec5
 from . import convex, cylinder, triangle
 from .convex import Convex
 
@@ -54,7 +54,12 @@ _MIXED = {"margin": (), "slide": (), "whose": (), "condim": (), "friction": (5,)
 _GREATER, _TOOL, _ORGAN = wp.constant(0), wp.constant(1), wp.constant(2)
 
 
-@struct
+@theirs(
+  "out_",
+  data="nacon",
+  contact="dist pos frame includemargin friction solref solreffriction solimp dim geom flex elem "
+  "vert worldid type geomcollisionid efc_address",
+)
 class Touch:
   """How an organ's triangles touch each tool, and mujoco_warp's contacts."""
 
@@ -83,25 +88,6 @@ class Touch:
   before: ints("nworld")  # of the worlds before it
   missed: ints("nworld")  # see `Patch`
   start: ints(1)  # the organ's first contact
-  # mujoco_warp:
-  nacon: ints(1)
-  out_dist: floats("naconmax")
-  out_pos: Array(wp.vec3, ("naconmax",))
-  out_frame: Array(wp.mat33, ("naconmax",))
-  out_includemargin: floats("naconmax")
-  out_friction: Array(vec5, ("naconmax",))
-  out_solref: Array(wp.vec2, ("naconmax",))
-  out_solreffriction: Array(wp.vec2, ("naconmax",))
-  out_solimp: Array(vec5, ("naconmax",))
-  out_dim: ints("naconmax")
-  out_geom: Array(wp.vec2i, ("naconmax",))
-  out_flex: Array(wp.vec2i, ("naconmax",))
-  out_elem: Array(wp.vec2i, ("naconmax",))
-  out_vert: Array(wp.vec2i, ("naconmax",))
-  out_worldid: ints("naconmax")
-  out_type: ints("naconmax")
-  out_geomcollisionid: ints("naconmax")
-  out_efc_address: ints("naconmax", "nrow")
 
 
 @wp.struct
@@ -413,9 +399,8 @@ def make(organ: "Organ", model: mujoco.MjModel, tools: np.ndarray, lines: list):
   flexes = [mujoco.mj_name2id(bare, kind, line.name) for line in lines]
   mixed = {name: np.array([row[name] for row in rows]).reshape(-1, *wide)
            for name, wide in _MIXED.items()}  # fmt: skip
-  contact = {f"out_{name}": getattr(data.contact, name) for name in _written()}
   lifts = bool(organ.config.needles)
-  values = mixed | contact | dict(
+  values = mixed | arrays_of(Touch, None, data) | dict(
     most=most_of(model, tools, lines, nslot),
     nline=len(half),
     line_flex=np.repeat(flexes, number),
@@ -435,13 +420,8 @@ def make(organ: "Organ", model: mujoco.MjModel, tools: np.ndarray, lines: list):
     lifts=int(lifts),
     lifted=organ.host.lifted() if lifts else np.zeros((nworld, 0)),
     line_lift=np.repeat([model.ngeom + 2 * line.flex for line in lines], number),
-    nacon=data.nacon,
   )  # fmt: skip
   return fill(Touch, data.nacon.device, values)
-
-
-def _written() -> list[str]:
-  return [name.removeprefix("out_") for name in Touch.vars if name.startswith("out_")]
 
 
 def _mix(model, kind: str, g: int, f: int) -> dict:

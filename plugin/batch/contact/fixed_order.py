@@ -24,7 +24,7 @@ from palpate.tissue.kernels import meet_block
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
 from .. import private
-from ..private import ConstraintState, ConstraintType, vec5
+from ..private import ConstraintState, ConstraintType, arrays_of, theirs
 
 # Columns of mujoco_warp's rows that move with them.
 _COLUMNS = ("type", "id", "J_rownnz", "J_rowadr", "pos", "margin", "D", "vel", "aref",
@@ -49,15 +49,11 @@ class Column:
   words: ints("nworld", "njmax")
 
 
-@struct
+@theirs(data="nacon", contact="geom worldid geomcollisionid")
 class Pairs:
   """The contacts that mujoco_warp has found between geoms, and room to put them in order."""
 
   ngeom: int
-  nacon: ints(1)
-  geom: Array(wp.vec2i, ("naconmax",))
-  number: ints("naconmax")  # among those of two geoms
-  worldid: ints("naconmax")
   moved: Array(Column, ("ncolumn",))  # what moves
   count: ints("nworld")  # contacts of a world, 0 between steps
   listed: ints("nworld", _ROOM)  # as they came
@@ -66,48 +62,32 @@ class Pairs:
   kept: Array(Column, ("ncolumn",))  # of what is moved
 
 
-@struct
+@theirs(
+  option="impratio_invsqrt",
+  data="nefc dof_frictionadr",
+  contact="friction efc_address",
+  efc="type id D state force J J_colind",
+)
 class Rows:
   """The constraint rows of mujoco_warp, and room to put them in order."""
 
-  nefc: ints("nworld")
-  type: ints("nworld", "njmax")
-  id: ints("nworld", "njmax")  # of the joint, the contact, ...
   moved: Array(Column, ("ncolumn",))  # what moves: `_COLUMNS`
-  frictionadr: ints("nworld", "nv")  # row of a dof's friction
-  contact_row: ints("naconmax", "nrow")
   part: ints("nworld", "njmax")  # which of its contact's rows
   kept: Array(Column, ("ncolumn",))  # of what is moved
   # What sums over them need:
-  friction: Array(vec5, ("naconmax",))
-  impratio_invsqrt: floats("nworld")
-  D: floats("nworld", "njmax")
-  state: ints("nworld", "njmax")
-  force: floats("nworld", "njmax")
-  colind: ints("nworld", 1, "njmax_nnz")
-  J: floats("nworld", 1, "njmax_nnz")
   whole: floats("nworld", "njmax", "nv")  # J, of all dofs
   weighed: floats("nworld", "njmax", "nv")  # D J, or the curvature of a cone times J
 
 
-@struct
+@theirs(
+  model="sensor_touch_adr sensor_objid sensor_adr site_type site_bodyid site_size geom_bodyid",
+  data="site_xpos site_xmat sensordata",
+  contact="geom pos frame",
+)
 class Touches:
   """The touch sensors, and the contacts that they feel."""
 
   pyramids: int  # whether a contact's force is the sum of its rows
-  sensor: ints("ntouch")
-  site: ints("nsensor")
-  adr: ints("nsensor")
-  site_type: ints("nsite")
-  site_body: ints("nsite")
-  size: Array(wp.vec3, ("nsite",))
-  geom_body: ints("ngeom")
-  site_xpos: Array(wp.vec3, ("nworld", "nsite"))
-  site_xmat: Array(wp.mat33, ("nworld", "nsite"))
-  geom: Array(wp.vec2i, ("naconmax",))
-  pos: Array(wp.vec3, ("naconmax",))
-  frame: Array(wp.mat33, ("naconmax",))
-  out: floats("nworld", "nsensordata")
 
 
 @wp.kernel(enable_backward=False)
@@ -124,7 +104,7 @@ def _list_contacts(p: Pairs):
 @wp.func
 def _pair_key(p: Pairs, c: int):
   pair = p.geom[c]
-  return wp.int64(pair[0] * p.ngeom + pair[1]) * wp.int64(_PAIR) + wp.int64(p.number[c])
+  return wp.int64(pair[0] * p.ngeom + pair[1]) * wp.int64(_PAIR) + wp.int64(p.geomcollisionid[c])
 
 
 @wp.kernel(enable_backward=False)
@@ -195,7 +175,7 @@ def _sort_rows(r: Rows):
         to += 1
     part = int(0)  # noqa: RUF046, UP018
     if r.type[w, k] >= _CONTACT:
-      part = k - r.contact_row[r.id[w, k], 0]
+      part = k - r.efc_address[r.id[w, k], 0]
     r.part[w, to] = part
     for f in range(r.moved.shape[0]):
       kept = r.kept[f].words
@@ -209,12 +189,12 @@ def _sort_rows(r: Rows):
       column[w, k] = r.kept[f].words[w, k]
     kind, number = r.kept[_TYPE].words[w, k], r.kept[_ID].words[w, k]
     if kind >= _CONTACT:
-      r.contact_row[number, r.part[w, k]] = k
+      r.efc_address[number, r.part[w, k]] = k
     elif kind == _FRICTION:
-      r.frictionadr[w, number] = k
+      r.dof_frictionadr[w, number] = k
     start = r.kept[_ROWADR].words[w, k]
     for q in range(start, start + r.kept[_ROWNNZ].words[w, k]):
-      r.whole[w, k, r.colind[w, 0, q]] = r.J[w, 0, q]
+      r.whole[w, k, r.J_colind[w, 0, q]] = r.J[w, 0, q]
 
 
 @wp.func
@@ -318,17 +298,17 @@ def _update(
 def _touch(r: Rows, t: Touches):
   """Adds up the normal forces of contacts of a touch sensor's body that its site sees."""
   w, s = wp.tid()
-  sensor = t.sensor[s]
-  site = t.site[sensor]
-  body = t.site_body[site]
+  sensor = t.sensor_touch_adr[s]
+  site = t.sensor_objid[sensor]
+  body = t.site_bodyid[site]
   n = _count(r, w)
   total = float(0.0)  # noqa: UP018 - a variable to Warp
   for k in range(n):
     if r.type[w, k] >= _CONTACT and r.part[w, k] == 0:
       c = r.id[w, k]
       geom = t.geom[c]
-      second = t.geom_body[geom[1]] == body
-      if second or t.geom_body[geom[0]] == body:
+      second = t.geom_bodyid[geom[1]] == body
+      if second or t.geom_bodyid[geom[0]] == body:
         force = r.force[w, k]
         q = k + 1
         while t.pyramids != 0 and q < n and r.part[w, q] == q - k:
@@ -338,12 +318,11 @@ def _touch(r: Rows, t: Touches):
         way = wp.normalize(wp.vec3(frame[0, 0], frame[0, 1], frame[0, 2]))
         if second:
           way = -way
-        far, _normal = private.ray_geom(
-          t.site_xpos[w, site], t.site_xmat[w, site], t.size[site], t.pos[c], way, t.site_type[site]
-        )
+        at, turn, size = t.site_xpos[w, site], t.site_xmat[w, site], t.site_size[site]
+        far, _normal = private.ray_geom(at, turn, size, t.pos[c], way, t.site_type[site])
         if force > 0.0 and far >= 0.0:
           total += force
-  t.out[w, t.adr[sensor]] = total
+  t.sensordata[w, t.sensor_adr[sensor]] = total
 
 
 # In place of kernels of mujoco_warp's, with their arguments.
@@ -459,19 +438,8 @@ class FixedOrder:
     self._kept: list[wp.array] = []
     device = efc.type.device
     values = dict(
-      nefc=d.nefc,
-      type=efc.type,
-      id=efc.id,
-      frictionadr=d.dof_frictionadr,
-      contact_row=contact.efc_address,
+      **arrays_of(Rows, m, d),
       part=np.zeros(shape),
-      friction=contact.friction,
-      impratio_invsqrt=m.opt.impratio_invsqrt,
-      D=efc.D,
-      state=efc.state,
-      force=efc.force,
-      colind=efc.J_colind,
-      J=efc.J,
     )
     values |= {name: np.zeros((*shape, m.nv)) for name in ("whole", "weighed")}
     values |= self._room_for([getattr(efc, name) for name in _COLUMNS])
@@ -480,30 +448,13 @@ class FixedOrder:
     columns = self._room_for([array for array in each if array.shape == contact.dist.shape])
     self._pairs = fill(Pairs, device, dict(
       ngeom=m.ngeom,
-      nacon=d.nacon,
-      geom=contact.geom,
-      number=contact.geomcollisionid,
-      worldid=contact.worldid,
+      **arrays_of(Pairs, m, d),
       **columns,
       count=np.zeros(d.nworld),
       **{name: np.zeros((d.nworld, _ROOM)) for name in ("listed", "place", "to")},
     ))  # fmt: skip
-    self._touches = fill(Touches, device, dict(
-      pyramids=int(m.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL),
-      sensor=m.sensor_touch_adr,
-      site=m.sensor_objid,
-      adr=m.sensor_adr,
-      site_type=m.site_type,
-      site_body=m.site_bodyid,
-      size=m.site_size,
-      geom_body=m.geom_bodyid,
-      site_xpos=d.site_xpos,
-      site_xmat=d.site_xmat,
-      geom=contact.geom,
-      pos=contact.pos,
-      frame=contact.frame,
-      out=d.sensordata,
-    ))  # fmt: skip
+    pyramids = int(m.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL)
+    self._touches = fill(Touches, device, {"pyramids": pyramids} | arrays_of(Touches, m, d))
 
   def _room_for(self, arrays: list[wp.array]) -> dict[str, wp.array]:
     """Returns the columns of arrays that move, and of others that keep them meanwhile."""
@@ -569,7 +520,7 @@ class FixedOrder:
     evaluate = sensor.sensor_acc
 
     def feel(m, d, *args, **kwargs):
-      dim = d.nworld, self._touches.sensor.size
+      dim = d.nworld, self._touches.sensor_touch_adr.size
       wp.launch(_touch, dim=dim, inputs=[self._rows, self._touches])
       evaluate(m, d, *args, **kwargs)
 
