@@ -142,11 +142,10 @@ class Surface:
   def _open(self, model: mujoco.MjModel, scene: Scene) -> int:
     """Makes room for what cuts open; returns the number of its thing, -1 for none."""
     m, organ = mjstruct.Model.from_address(model._address), self._organ
-    names = [flexes.name(m, f) for f in range(m.nflex)]
-    found = organ.config.walls and flexes.resolve(organ.config.walls, organ.name, names)
-    if not found:
+    walls = organ.config.walls
+    flex = flexes.find(m, "flex", walls, organ.name) if walls else -1
+    if flex < 0:
       return -1
-    flex = names.index(found)
     if len(organ.mesh.tet):
       self._walls = len(flexes.element_data(m, flex))
       room = np.zeros((self._walls, 3, 2))

@@ -94,10 +94,9 @@ def tools(m: mjstruct.Struct, organ: "Declaration") -> np.ndarray:
   body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
   weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)
   meets = np.unique(np.concatenate([flexes.meeting_geoms(m, flex) for flex in organ.flexes]))
-  names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
-  needles = [flexes.resolve(row.name, organ.name, names) for row in organ.config.needles]
-  own = [names.index(name) for name in needles if name]  # which go through it by right
-  return meets[(weld[body[meets]] != 0) & ~np.isin(body[meets], own)]
+  needles = [flexes.find(m, "body", row.name, organ.name) for row in organ.config.needles]
+  # Needles go through it by right.
+  return meets[(weld[body[meets]] != 0) & ~np.isin(body[meets], needles)]
 
 
 @coupling.memory("geom_bodyid", "body_rootid", "geom_xpos", "cvel", "subtree_com")

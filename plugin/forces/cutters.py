@@ -137,7 +137,8 @@ class Cutters(Force):
         axis[i, k], half[i, k], width = _shape(host, g)
         self._width[i] = max(self._width[i], width)
       if rows[i].current:
-        actuator, shape = _find_actuator(host, rows[i].current), _shape(host, geoms[0])
+        actuator = flexes.need(m, "actuator", rows[i].current, host.organ.name, "cutters")
+        shape = _shape(host, geoms[0])
         self.by_current[i] = trails.current(geoms[0], actuator, rows[i].energy, shape, skin)
     self.names = [tuple(_name(m, g) for g in geoms) for geoms in found]
     self.geoms = {"geom": geom, "axis": axis, "half": half}
@@ -301,27 +302,9 @@ def _name(m, geom: int) -> str:
   return mjstruct.name_of(m, m.name_geomadr, geom)
 
 
-def _find_actuator(host: Host, name: str) -> int:
-  m = host.m
-  names = [mjstruct.name_of(m, m.name_actuatoradr, a) for a in range(m.nu)]
-  found = flexes.resolve(name, host.organ.name, names)
-  if found is None:
-    raise ValueError(
-      f"organ {host.organ.name!r}: cutters names {name!r}, which is no actuator of the model"
-    )
-  return names.index(found)
-
-
 def _find(host: Host, name: str, current: bool) -> int:
-  m = host.m
-  names = [_name(m, g) for g in range(m.ngeom)]
-  found = flexes.resolve(name, host.organ.name, names)
-  if found is None:
-    raise ValueError(
-      f"organ {host.organ.name!r}: cutters names {name!r}, which is no geom of the model"
-    )
-  geom = names.index(found)
-  flex = host.organ.flexes
+  m, flex = host.m, host.organ.flexes
+  geom = flexes.need(m, "geom", name, host.organ.name, "cutters")
   if not current and not host.organ.mesh.spare:
     raise ValueError(
       f"organ {host.organ.name!r}: cutters names {name!r}, which cuts by its edge, allowed only "

@@ -24,10 +24,9 @@ _LIGHT = 0.5
 def declare(held: Attachments, host: Host):
   """Attaches an organ to the bodies that its configuration names."""
   made, m = carried(host), host.m
-  flex_names = [flexes.name(m, f) for f in range(m.nflex)]
   for name, stiffness, vertices in host.config.attach:
-    if flexes.resolve(name, host.organ.name, flex_names) is None:
-      body = find_body(host, "attach", name)
+    if flexes.find(m, "flex", name, host.organ.name) < 0:
+      body = flexes.need(m, "body", name, host.organ.name, "attach")
       made.append(to_body(host, check_vertices(host, vertices), body, stiffness, now=False))
   held.put(made)
 
@@ -97,7 +96,9 @@ def carried(host: Host) -> list[Group]:
     return []
   mesh = organ.mesh.whole
   area = topology.vertex_areas(mesh.rest, mesh.elem)
-  body = TO_OWN_MOTION if name == OWN else find_body(host, "carrier", name)
+  body = TO_OWN_MOTION
+  if name != OWN:
+    body = flexes.need(host.m, "body", name, organ.name, "carrier")
   pins = np.array(sorted(host.config.pin), int)
   stiffness = host.config.foundation * area
   stiffness[pins] = _firm(host)[pins]
@@ -111,16 +112,6 @@ def carried(host: Host) -> list[Group]:
     anchor, axes = (place - origin) @ turn, turn.T @ organ.frame
   made = {"stiffness": stiffness[vert], "anchor": anchor, "turn": axes}
   return [Group(Grip(mesh, vert), body, made, by="carrier")]
-
-
-def find_body(host: base.Host, key: str, name: str) -> int:
-  """Returns the body that an organ's configuration names, by its own name or with its prefix."""
-  m = host.m
-  names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
-  found = flexes.resolve(name, host.organ.name, names)
-  if found is None:
-    raise ValueError(f"organ {host.organ.name!r}: {key} names {name!r}, which does not exist")
-  return names.index(found)
 
 
 def check_vertices(host: Host, vertices: npt.ArrayLike) -> np.ndarray:

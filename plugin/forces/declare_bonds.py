@@ -16,7 +16,7 @@ from ..engine.layout import GEOM
 from ..engine.model import flexes, mjstruct
 from . import transfer
 from .cohesive_bonds import ON_ORGAN, Bonds, Group
-from .declare_attachments import check_vertices, find_body, most
+from .declare_attachments import check_vertices, most
 from .transfer import Grip, Spots
 
 
@@ -46,11 +46,10 @@ def declare(bonds: Bonds, host: Host):
   Raises:
     ValueError: it names a body that does not exist, or no vertex is near one.
   """
-  m = host.m
-  flex_names = [flexes.name(m, f) for f in range(m.nflex)]
+  m, organ = host.m, host.organ.name
   for row in host.config.bonds or ():
-    if flexes.resolve(row.to, host.organ.name, flex_names) is None:
-      body = find_body(host, "bonds", row.to)
+    if flexes.find(m, "flex", row.to, organ) < 0:
+      body = flexes.need(m, "body", row.to, organ, "bonds")
       bonds.put(to_body(host, body, row.to, row.law, row.near, row.vertices, now=False))
 
 

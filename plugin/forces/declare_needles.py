@@ -11,7 +11,6 @@ from palpate.tissue import config as configuration
 from palpate.tissue.geometry.mesh import Mesh
 
 from ..engine.model import declare, flexes, mjstruct
-from .declare_attachments import find_body
 from .host import Host
 
 _ENDS = ("swage", "tip")
@@ -28,7 +27,7 @@ def is_free(m, body: int) -> bool:
 def read(host: Host, name: str) -> dict[str, Any]:
   """Returns the arc, the tip and the geoms of a needle."""
   m, organ = host.m, host.organ
-  body = find_body(host, "needles", name)
+  body = flexes.need(m, "body", name, organ.name, "needles")
   mine = np.flatnonzero(mjstruct.view(m.site_bodyid, m.nsite, np.int32) == body)
   sites = {mjstruct.name_of(m, m.name_siteadr, int(site)): site for site in mine}
   ends = [next((sites[s] for s in sites if s.endswith(f"_{end}")), None) for end in _ENDS]

@@ -16,9 +16,9 @@ from palpate.tissue.types import doubles, ints, struct
 
 from ..engine import contacts
 from ..engine.layout import HOLE, HOLES, NEEDLE, PIERCE, TIE
-from ..engine.model import mjstruct
+from ..engine.model import flexes, mjstruct
 from . import declare_needles, transfer
-from .declare_attachments import find_body, most
+from .declare_attachments import most
 from .host import Bodies, Host, Input, Nodes, edited, kernels
 from .passive import Force
 
@@ -230,7 +230,8 @@ class Needles(Force):
     host, config = self.host, self.host.config
     m, out = host.m, np.zeros((len(asked), len(self.names), len(PIERCE)))
     stiffness = contacts.FIRM / (asked * (contacts.SLOW * float(m.opt.timestep)) ** 2)
-    bodies = [find_body(host, "needles", row.name) for row in config.needles]
+    organ = host.organ.name
+    bodies = [flexes.need(m, "body", row.name, organ, "needles") for row in config.needles]
     for k, row in enumerate(config.needles):
       free = bool(self._shape["floats"][k])
       out[:, k, PIERCE.force] = row.energy * self._slit[k]

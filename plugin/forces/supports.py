@@ -184,9 +184,9 @@ class Supports(Force):
 
   def _geoms(self) -> np.ndarray:
     """Returns the geoms that its configuration names."""
-    names, organ = _geom_names(self.host.m), self.host.organ
-    found = [flexes.resolve(name, organ.name, names) for name in organ.config.support]
-    return np.array([names.index(name) for name in found if name is not None], int)
+    m, organ = self.host.m, self.host.organ
+    found = [flexes.find(m, "geom", name, organ.name) for name in organ.config.support]
+    return np.array([geom for geom in found if geom >= 0], int)
 
   @property
   def aims(self) -> bool:
@@ -247,8 +247,8 @@ def check(host: Host):
     ValueError: one does not exist.
   """
   m, organ = host.m, host.organ
-  geoms = _geom_names(m)
-  names = geoms + [flexes.name(m, f) for f in range(m.nflex)]
+  geoms = flexes.names(m, "geom")
+  names = geoms + flexes.names(m)
   found = [flexes.resolve(name, organ.name, names) for name in organ.config.support]
   if None in found:
     raise ValueError(
@@ -269,10 +269,6 @@ def _warn_twice(organ: str, geom: str):
     f"organ {organ!r}: geom {geom!r} bears it by support and contact, so twice; give the geom "
     "contype and conaffinity that do not meet the organ's"
   )
-
-
-def _geom_names(m: Any) -> list[str]:
-  return [mjstruct.name_of(m, m.name_geomadr, g) for g in range(m.ngeom)]
 
 
 def _friction(m: Any, flex: int) -> float:

@@ -234,9 +234,9 @@ def test_what_cannot_be_attached_is_named(make, arguments, message):
   [
     ({"attach": "hook 500"}, "attach is 'hook 500', expected a body or organ, a stiffness > 0"),
     ({"attach": "hook 0 3"}, "attach is 'hook 0 3', expected"),
-    ({"attach": "nobody 5 3"}, "attach names 'nobody', which does not exist"),
+    ({"attach": "nobody 5 3"}, "attach names 'nobody', which is no body"),
     ({"attach": "hook 5 900"}, "vertices have 900"),
-    ({"carrier": "nobody", "foundation": 1e4}, "carrier names 'nobody', which does not exist"),
+    ({"carrier": "nobody", "foundation": 1e4}, "carrier names 'nobody', which is no body"),
     ({"carrier": "hook", "integrator": "neumann"}, "allowed only without carrier"),
   ],
 )

@@ -444,7 +444,7 @@ def test_an_organ_without_the_key_has_no_room(make):
     ({"bonds": "bed 1e7 2e3 2"}, "bonds is 'bed 1e7 2e3 2', expected 'none', or a body or organ"),
     ({"bonds": "bed 1e7 2e3 -2 near 0.004"}, "bonds has energy -2"),
     ({"bonds": "bed 1e7 2e3 2 near 0"}, "expected 'none', or a body or organ"),
-    ({"bonds": "nobody 1e7 2e3 2 near 0.004"}, "bonds names 'nobody', which does not exist"),
+    ({"bonds": "nobody 1e7 2e3 2 near 0.004"}, "bonds names 'nobody', which is no body"),
     ({"bonds": "bed 1e7 2e3 2 near 0.0001"}, "no free vertex within 0.0001 m of 'bed'"),
     ({"bonds": "bed 1e7 2e3 2 at 3 900"}, "vertices have 900"),
     ({"bonds": "none", "integrator": "neumann"}, "allowed only without bonds"),

@@ -394,7 +394,7 @@ def test_nothing_is_lost_in_violent_motion(free):
   ("given", "message"),
   [
     ({"needles": "hand 100"}, "needles names 'hand', which has no geoms or no sites"),
-    ({"needles": "pin 100"}, "needles names 'pin', which does not exist"),
+    ({"needles": "pin 100"}, "needles names 'pin', which is no body"),
     ({"needles": "needle"}, "needles is 'needle', expected a body, an energy > 0"),
     ({"needles": "needle -1"}, "expected a body, an energy > 0"),
     ({"height": -0.003}, "needle 'needle' begins in it, expected one outside"),

@@ -40,7 +40,7 @@ class Walls:
     if not name:
       return
     m = mjstruct.Model.from_address(model)
-    names = [flexes.name(m, f) for f in range(m.nflex)]
+    names = flexes.names(m)
     found = flexes.resolve(name, organ.name, names)
     if found is None:
       raise ValueError(f"organ {organ.name!r}: walls is {name!r}, the model has {names}")

@@ -16,6 +16,14 @@ def name(m, flex: int) -> str:
   return mjstruct.name_of(m, m.name_flexadr, flex) or f"flex {flex}"
 
 
+def names(m, kind: str = "flex") -> list[str]:
+  """Returns the names of all flexes, bodies, geoms, skins or actuators."""
+  if kind == "flex":
+    return [name(m, flex) for flex in range(m.nflex)]
+  count = m.nu if kind == "actuator" else getattr(m, f"n{kind}")
+  return [mjstruct.name_of(m, getattr(m, f"name_{kind}adr"), k) for k in range(count)]
+
+
 def meeting_geoms(m, flex: int) -> np.ndarray:
   """Returns the geoms that collide with a flex."""
   contype = mjstruct.view(m.geom_contype, m.ngeom, np.int32)
@@ -123,6 +131,21 @@ def resolve(name: str, organ: str, names: list[str]) -> str | None:
   prefixes = [other[: len(other) - len(name)] for other in names if other.endswith(name)]
   prefixes = [prefix for prefix in prefixes if organ.startswith(prefix)]
   return max(prefixes, key=len) + name if prefixes else None
+
+
+def find(m, kind: str, name: str, organ: str) -> int:
+  """Returns the index of what an organ's configuration names, -1 if there is none."""
+  have = names(m, kind)
+  found = resolve(name, organ, have)
+  return -1 if found is None else have.index(found)
+
+
+def need(m, kind: str, name: str, organ: str, key: str) -> int:
+  """Returns the index of what a key of an organ's configuration names; ValueError if none."""
+  found = find(m, kind, name, organ)
+  if found < 0:
+    raise ValueError(f"organ {organ!r}: {key} names {name!r}, which is no {kind} of the model")
+  return found
 
 
 def named(

@@ -53,7 +53,7 @@ def read(m: mjstruct.Struct, organ: Declaration) -> Skin | None:
   """
   if not organ.config.skin:
     return None
-  names = [mjstruct.name_of(m, m.name_skinadr, k) for k in range(m.nskin)]
+  names = flexes.names(m, "skin")
   name = flexes.resolve(organ.config.skin, organ.name, names)
   if name is None:
     have = ", ".join(repr(each) for each in names) or "none"

@@ -132,7 +132,7 @@ def _windows(
 
 def _claimed(model: int, m: mjstruct.Struct, instance: int, name: str, config: Config) -> int:
   """Returns the flex that an organ names as its window and nobody else does."""
-  names = [flexes.name(m, f) for f in range(m.nflex)]
+  names = flexes.names(m)
   surface = _surfaces(model, m, instance, without=instance)
   what = f"organ {name!r}: window {config.window!r}"
   found = flexes.resolve(config.window, name, names)
@@ -185,9 +185,8 @@ def _followed(m: mjstruct.Struct, name: str, config: Config, flex: int) -> np.nd
 def _tips(m: mjstruct.Struct, name: str, config: Config) -> list[int]:
   """Returns the last geom of each needle that goes through an organ: that of its tip."""
   bodyid = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
-  names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
-  found = [flexes.resolve(row.name, name, names) for row in config.needles]
-  geoms = [np.flatnonzero(bodyid == names.index(body)) for body in found if body is not None]
+  bodies = [flexes.find(m, "body", row.name, name) for row in config.needles]
+  geoms = [np.flatnonzero(bodyid == body) for body in bodies]
   return [int(each[-1]) for each in geoms if len(each)]
 
 
@@ -198,18 +197,15 @@ def _tools(m: mjstruct.Struct, name: str, config: Config, flex: int) -> list[int
   if not config.follow:
     weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)
     return [g for g in meets if weld[bodyid[g]] or not config.held]
-  names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
   wanted = set()
   for body in config.follow:
-    found = flexes.resolve(body, name, names)
-    if found is None:
-      raise ValueError(f"organ {name!r}: follow names body {body!r}, which does not exist")
-    if not any(bodyid[g] == names.index(found) for g in meets):
+    found = flexes.need(m, "body", body, name, "follow")
+    if not any(bodyid[g] == found for g in meets):
       raise ValueError(
         f"organ {name!r}: follow names body {body!r}, which has no geoms that collide with its "
         "window, expected bodies with geoms"
       )
-    wanted.add(names.index(found))
+    wanted.add(found)
   return [g for g in meets if bodyid[g] in wanted]
 
 
@@ -278,7 +274,7 @@ def _check_neighbours(
 
 def _bearing(model: int, m: mjstruct.Struct, instance: int, name: str) -> set[str]:
   """Returns the organs on which one rests, and those that rest on it."""
-  names = [flexes.name(m, f) for f in range(m.nflex)]
+  names = flexes.names(m)
   found = {}
   for other in range(m.nplugin):
     for flex in _rigid_flexes(m, other)[1]:
@@ -303,7 +299,7 @@ def touching(model: int, instance: int) -> np.ndarray:
 
 def _surfaces(model: int, m: mjstruct.Struct, instance: int, without: int = -1) -> dict[int, int]:
   """Returns the flex of the organ that each window is of, of all organs or without one."""
-  names = [flexes.name(m, f) for f in range(m.nflex)]
+  names = flexes.names(m)
   plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
   found = {}
   for other in range(m.nplugin):
