@@ -21,17 +21,9 @@ if TYPE_CHECKING:
   from .windows import add_windows
 
 __all__ = [
-  "Organ",
-  "Thread",
-  "__version__",
-  "add_needle",
-  "add_organ",
-  "add_skin",
-  "add_spare",
-  "add_thread",
-  "add_windows",
-  "register",
-]
+  "Organ", "Thread", "__version__", "add_needle", "add_organ", "add_skin", "add_spare",
+  "add_thread", "add_windows", "register",
+]  # fmt: skip
 __version__ = "0.2.0"
 # Modules of what `register` brings, and of what comes when it is asked for.
 _BROUGHT = {

@@ -60,15 +60,9 @@ def add_skin(
   if texcoord is not None:
     look["texcoord"] = _fine(organ, texcoord, smooth, len(rest), count).ravel()
   skin = spec.add_skin(
-    name=name,
-    vert=points.ravel(),
-    face=smooth.elem.ravel(),
-    bodyname=[parent],
-    bindpos=[0.0, 0.0, 0.0],
-    bindquat=[1.0, 0.0, 0.0, 0.0],
-    group=flex.group,
-    **look,
-  )
+    name=name, vert=points.ravel(), face=smooth.elem.ravel(), group=flex.group,
+    bodyname=[parent], bindpos=[0.0, 0.0, 0.0], bindquat=[1.0, 0.0, 0.0, 0.0], **look,
+  )  # fmt: skip
   skin.vertid, skin.vertweight = [np.arange(count)], [np.ones(count)]
   flex.group, config["skin"] = HIDDEN, name
   plugin.config = config

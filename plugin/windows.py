@@ -300,14 +300,9 @@ def make_flex(spec, name: str, points: np.ndarray, bodies: list[str], elem: np.n
   """
   # A flex without forces of its own makes MuJoCo warn; the plugin sets its damping to 0.
   return spec.add_flex(
-    name=name,
-    dim=elem.shape[1] - 1,
-    vert=points.ravel(),
-    vertbody=bodies,
-    elem=elem.ravel(),
-    edgedamping=1e-9,
-    **look,
-  )
+    name=name, dim=elem.shape[1] - 1, vert=points.ravel(), vertbody=bodies, elem=elem.ravel(),
+    edgedamping=1e-9, **look,
+  )  # fmt: skip
 
 
 def _warn_of_others(

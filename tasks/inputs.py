@@ -11,40 +11,17 @@ import numpy as np
 from . import metrics as m
 from .metrics import METRICS, Metrics, Spec, Unknown, UnknownError
 
-# What is recorded of each instrument, and the width of an entry; force is a vector or a magnitude.
+# What is recorded of each instrument: single numbers, and all with the width of an entry; force is
+# a vector or a magnitude.
+_NUMBERS = (
+  "grip_force", "shaft_force", "surroundings_force", "area", "strain", "grip", "held", "visible",
+  "centred", "horizon", "freed", "traction", "deviation", "farthest", "excess", "jagged", "depth",
+  "current", "idle_current", "regrasped", "ring_time", "ring_force", "bite", "gap", "tension",
+  "torn", "security",
+)  # fmt: skip
 COLUMNS: dict[str, tuple[int, ...]] = {
-  "tip_pos": (3,),
-  "quat": (4,),
-  "axis": (3,),
-  "force": (3,),
-  "grip_force": (),
-  "shaft_force": (),
-  "surroundings_force": (),
-  "area": (),
-  "strain": (),
-  "grip": (),
-  "held": (),
-  "visible": (),
-  "centred": (),
-  "horizon": (),
-  "freed": (),
-  "traction": (),
-  "deviation": (),
-  "farthest": (),
-  "excess": (),
-  "jagged": (),
-  "depth": (),
-  "current": (),
-  "idle_current": (),
-  "regrasped": (),
-  "ring_time": (),
-  "ring_force": (),
-  "bite": (),
-  "gap": (),
-  "tension": (),
-  "torn": (),
-  "security": (),
-}
+  "tip_pos": (3,), "quat": (4,), "axis": (3,), "force": (3,), **dict.fromkeys(_NUMBERS, ()),
+}  # fmt: skip
 # Those that are measured faster: with substeps, magnitudes, one for each since the last sample.
 SIGNALS = ("force", "grip_force", "shaft_force", "surroundings_force")
 

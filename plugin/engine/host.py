@@ -68,16 +68,10 @@ class Host(host.Host):
     motion = self.own.motion if organ.windows else self.own
     disp, vel = (array.reshape((-1, 3)) for array in (motion.disp, motion.vel))
     values = dict(
-      windowed=int(organ.windows is not None),
-      inner=organ.mesh.nskin,
-      rest=self._rest,
-      disp=disp,
-      vel=vel,
-      qposadr=organ.qposadr,
-      dofadr=organ.dofadr,
-      frame=organ.frame,
-      origin=organ.origin,
-    )
+      windowed=int(organ.windows is not None), inner=organ.mesh.nskin,
+      rest=self._rest, disp=disp, vel=vel, qposadr=organ.qposadr, dofadr=organ.dofadr,
+      frame=organ.frame, origin=organ.origin,
+    )  # fmt: skip
     self.nodes = fill(Nodes, "cpu", values)
     self._rest.assign(self._from())
     self._fill_input()

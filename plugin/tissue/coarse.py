@@ -40,18 +40,9 @@ _BENDING = 0.1  # share of the diagonal from which bending asks for the smoother
 _OFFSETS = {"fan_node": 3 * LANES, "bend_node": LANES}
 _ROWS = {"slot_adr": "fan_spring", "bend_adr": "bend_node"}
 _PLAIN = (
-  "fan_rest",
-  "fan_metric",
-  "fan_spring",
-  "fan_width",
-  "degree",
-  "rest",
-  "area",
-  "free",
-  "bend_gain",
-  "bend_diag",
-  "bend_width",
-)
+  "fan_rest", "fan_metric", "fan_spring", "fan_width", "degree", "rest", "area", "free",
+  "bend_gain", "bend_diag", "bend_width",
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)

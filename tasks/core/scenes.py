@@ -208,16 +208,10 @@ def build(scene: Scene) -> mujoco.MjSpec:
     law, grown = mjcf.numbers(scene.bonds), " ".join(map(str, bed(*shape)))
     config |= {"bonds": f"{BED} {law} at {grown}", "foundation": _LOOSE}
   flex = mjcf.flexcomp(
-    ORGAN,
-    (vertices, triangles),
-    config=config,
-    contact=CONTACT,
-    pin=pins(*shape, BED if scene.bonds else ""),
-    digits=7,
-    mass=tissue.mass,
-    radius=0.001,
-    rgba=catalog.entry(scene.organ).rgba,
-  )
+    ORGAN, (vertices, triangles),
+    config=config, contact=CONTACT, pin=pins(*shape, BED if scene.bonds else ""), digits=7,
+    mass=tissue.mass, radius=0.001, rgba=catalog.entry(scene.organ).rgba,
+  )  # fmt: skip
   spec = furnish(scene, flex, center)
   if scene.inclusion is not None:
     spec.option.gravity = np.zeros(3)

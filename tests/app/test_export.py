@@ -34,6 +34,7 @@ IDLE = "import numpy as np\ndef act(observation): return np.zeros(4)\n"
 def export(*words) -> int:
   return cli.main(["export", *map(str, words)])
 
+
 pytestmark = pytest.mark.usefixtures("here")
 
 

@@ -23,6 +23,7 @@ def _here(tmp_path, monkeypatch):
   monkeypatch.delenv("DISPLAY", raising=False)
   monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 
+
 pytestmark = pytest.mark.usefixtures("can_render")
 
 

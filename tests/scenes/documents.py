@@ -27,15 +27,8 @@ def contacts(contact):
 def flex(points, elem, inside, name="organ", pin=(), contact=None, **attributes):
   """Returns a flexcomp whose nodes are MuJoCo's, around what is `inside` of it."""
   attributes = {"mass": 0.1, "radius": FLEX} | attributes
-  return mjcf.flexcomp(
-    name,
-    (points, elem),
-    inside=inside,
-    contact=contacts(contact),
-    pin=pin,
-    digits=DIGITS,
-    **attributes,
-  )
+  attributes |= {"inside": inside, "contact": contacts(contact), "pin": pin, "digits": DIGITS}
+  return mjcf.flexcomp(name, (points, elem), **attributes)
 
 
 def organ(
@@ -52,23 +45,12 @@ def windowed(
   """Returns an organ in a body of its own and the flexcomp of its window, `count` slots."""
   keys = plugin(**{"window": grid, "mass": 0.1} | config)
   surface = mjcf.flexcomp(
-    name,
-    (points, elem),
-    contact=mjcf.NO_CONTACT,
-    digits=DIGITS,
-    rigid=True,
-    radius=radius,
+    name, (points, elem), contact=mjcf.NO_CONTACT, digits=DIGITS, rigid=True, radius=radius
   )
   window = mjcf.flexcomp(
-    grid,
-    inside=mjcf.EDGE,
-    contact=contacts(contact),
-    type="grid",
-    count=count,
-    spacing=".01 .01 .01",
-    mass=0.01,
-    radius=radius,
-  )
+    grid, inside=mjcf.EDGE, contact=contacts(contact), type="grid", count=count,
+    spacing=".01 .01 .01", mass=0.01, radius=radius,
+  )  # fmt: skip
   return mjcf.tag("body", {"name": name}, f"{keys}\n{surface}") + window
 
 

@@ -10,15 +10,9 @@ from palpate.tissue import body, config, step, types
 from palpate.tissue.geometry import mesh, plate
 
 CLASSES = (
-  body.Body,
-  body.Levels,
-  config.Row,
-  mesh.Mesh,
-  plate.Hinges,
-  step.Scheme,
-  workspace.Declaration,
-  workspace.Workspace,
-)
+  body.Body, body.Levels, config.Row, mesh.Mesh, plate.Hinges, step.Scheme,
+  workspace.Declaration, workspace.Workspace,
+)  # fmt: skip
 STRUCTS = ("Shape", "Tissue", "State", "System", "Transfer")
 
 

@@ -15,16 +15,6 @@ from .realtime_clock import Lateness, Pace
 from .session import Session
 
 __all__ = [
-  "NAMES",
-  "Device",
-  "DeviceError",
-  "Hand",
-  "Lateness",
-  "Link",
-  "Loop",
-  "Options",
-  "Pace",
-  "Reading",
-  "Session",
-  "device",
-]
+  "NAMES", "Device", "DeviceError", "Hand", "Lateness", "Link", "Loop", "Options", "Pace",
+  "Reading", "Session", "device",
+]  # fmt: skip

@@ -48,21 +48,10 @@ def read(model: int, instance: int) -> Declaration:
   absent = np.full(mesh.nvert, -1)
   return declare.cached(
     float(m.opt.timestep),
-    name=name,
-    flex=flex,
-    mesh=mesh,
-    config=config,
-    free=free,
-    body=np.full(mesh.nvert, parent),
-    dofadr=absent,
-    qposadr=absent,
-    stateadr=absent,
-    nfree=0,
-    frame=frame,
-    origin=origin,
-    mass=mass,
-    windows=windows,
-  )
+    name=name, flex=flex, mesh=mesh, config=config, free=free, mass=mass, windows=windows,
+    body=np.full(mesh.nvert, parent), dofadr=absent, qposadr=absent, stateadr=absent, nfree=0,
+    frame=frame, origin=origin,
+  )  # fmt: skip
 
 
 def _surface(m: mjstruct.Struct, instance: int) -> tuple[int, int]:

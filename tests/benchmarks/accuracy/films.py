@@ -97,16 +97,9 @@ def build(case: Case, scheme: str, h: float, **keys) -> mujoco.MjModel:
   if case["elements"] == "solid":
     keys = {"contact": HARD} | keys
   return scene.build(
-    mesh,
-    tissue,
-    scheme,
-    h,
-    probe=probe,
-    joined=joined,
-    friction=script.friction,
-    lumped=True,
-    **keys,
-  )
+    mesh, tissue, scheme, h,
+    probe=probe, joined=joined, friction=script.friction, lumped=True, **keys,
+  )  # fmt: skip
 
 
 class Film:

@@ -168,16 +168,9 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   contact = _contact(case)[0]
   window = case["coupling"] == "window"
   model = scene.build(
-    mesh,
-    tissue,
-    case["scheme"],
-    case["h"],
-    probe=probe,
-    contact=contact,
-    window=window,
-    heavy=True,
-    mj_tolerance=1e-12,
-  )
+    mesh, tissue, case["scheme"], case["h"],
+    probe=probe, contact=contact, window=window, heavy=True, mj_tolerance=1e-12,
+  )  # fmt: skip
   data = mujoco.MjData(model)
   row = Run(case, mesh, config, model, data, began).judge(foundation)
   names = ("side", "set", "scheme", "coupling", "shape", "start", "h", "young", "thickness")

@@ -88,14 +88,7 @@ def mjcf(subdivisions: int, side: str, kind: str, tolerance: float = 1e-4, h: fl
   drive = '<actuator><position joint="z" kp="500" kv="10"/></actuator>'
   integrator = "discrete" if side == "peer" else "Euler"
   return scenes.world(
-    organ,
-    probe,
-    h=h,
-    integrator=integrator,
-    solver="CG",
-    tolerance=1e-8,
-    memory=2048,
-    extra=drive,
+    organ, probe, h=h, integrator=integrator, solver="CG", tolerance=1e-8, memory=2048, extra=drive
   )
 
 
