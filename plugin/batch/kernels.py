@@ -6,7 +6,7 @@ import warp as wp
 from palpate.tissue.types import Array, doubles, floats, ints, struct
 
 from .patch import Patch
-from .private import theirs
+from .warp_arrays import theirs
 
 HELD = wp.constant(1.0 - 2.0**-24)  # the most damage that leaves a bond, in float32
 

@@ -32,8 +32,8 @@ from .cutting.cuts import Cuts
 from .cutting.fracture import Cutters
 from .material import KEYS, Material
 from .patch import launch
-from .private import arrays_of
 from .strip_organs import Slots
+from .warp_arrays import arrays_of
 
 if TYPE_CHECKING:
   from palpate.engine.workspace import Workspace

@@ -20,7 +20,8 @@ from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, also, doubles, floats, ints
 
 from ..patch import Patch, launch
-from ..private import arrays_of, contact_kbimp, theirs, vec5
+from ..private import contact_kbimp, vec5
+from ..warp_arrays import arrays_of, theirs
 
 if TYPE_CHECKING:
   from ..organs import Organ

@@ -22,7 +22,8 @@ from palpate.tissue.types import Array, fill, floats, ints
 from .. import private
 from ..kernels import triple
 from ..patch import Patch, halves
-from ..private import ContactType, arrays_of, theirs, vec5
+from ..private import ContactType, vec5
+from ..warp_arrays import arrays_of, theirs
 from . import convex, cylinder, triangle
 from .convex import Convex
 
