@@ -257,10 +257,7 @@ ENTRIES: dict[str, Entry] = {
     shininess=0.8,
     camera=(0.01, 0.085, 0.05),
     target=(0.004, 0.0, 0.008),
-    ports=(
-      Port("fundus", (0.6, 0.5, 0.7), gap=0.02),
-      Port("body", (-0.6, 0.8, 0.2), gap=0.02),
-    ),
+    ports=(Port("fundus", (0.6, 0.5, 0.7), gap=0.02), Port("body", (-0.6, 0.8, 0.2), gap=0.02)),
   ),
   "kidney": Entry(
     shape="kidney",

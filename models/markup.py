@@ -151,11 +151,7 @@ def look(pos, target) -> str:
 
 
 def scene(
-  build: Build,
-  name: str,
-  instruments: Sequence[str],
-  handle: bool = False,
-  root: str | None = "..",
+  build: Build, name: str, instruments: Sequence[str], handle: bool = False, root: str | None = ".."
 ) -> str:
   """Returns a scene of the catalogue as MJCF.
 

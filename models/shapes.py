@@ -275,11 +275,7 @@ def _gallbladder() -> Anatomy:
   pear = tube(axis, [1.5, 1.65, 1.2, 0.62, 0.42])
   pouch = ellipsoid([0.5, -1.5, 0.2], [0.8, 0.9, 0.8])  # Hartmann's pouch
   shape = union(0.6, pear, pouch)
-  marks = {
-    "fundus": [1.9, 3.6, -2.5],
-    "body": [0.7, 1.8, -2.2],
-    "infundibulum": [1.2, -1.6, -0.4],
-  }
+  marks = {"fundus": [1.9, 3.6, -2.5], "body": [0.7, 1.8, -2.2], "infundibulum": [1.2, -1.6, -0.4]}
   lines = {
     "neck": ([[-1.9, -3.8, 1.8], [-1.5, -3.4, 1.7]], 0.6),
     "bed": ([[1.0, 2.0, 0.4], [0.7, 0.8, 0.9], [0.1, -1.0, 1.7]], 0.6),

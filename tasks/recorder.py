@@ -323,12 +323,7 @@ class Recorder:
     self._constants[name] = array
 
   def event(
-    self,
-    kind: str,
-    time: float,
-    value: float | None = None,
-    instrument: int = 0,
-    label: str = "",
+    self, kind: str, time: float, value: float | None = None, instrument: int = 0, label: str = ""
   ) -> None:
     """Reports an event, see `Event`."""
     number = None if value is None else float(value)

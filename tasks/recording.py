@@ -318,9 +318,7 @@ def _check_column(name: str, value: np.ndarray, count: int, substeps: int) -> No
 
 
 def _reading(
-  path: str | os.PathLike[str],
-  read: Callable[[Any], Any],
-  join: Callable[[Iterator[Any]], Any],
+  path: str | os.PathLike[str], read: Callable[[Any], Any], join: Callable[[Iterator[Any]], Any]
 ) -> Any:
   """Returns what `read` makes of a file, or what `join` makes of its parts, each of them read.
 

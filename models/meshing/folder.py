@@ -87,10 +87,7 @@ def write(
   if solid:
     for name, (vertices, triangles, _) in organs.items():
       fill.fill(name, topology.build(name, vertices, triangles))
-  files = {
-    root / f"{SCENE}.xml": _scene(organs),
-    root / "README.md": _readme(organs, config),
-  }
+  files = {root / f"{SCENE}.xml": _scene(organs), root / "README.md": _readme(organs, config)}
   for name, (vertices, triangles, report) in organs.items():
     mesh, mass = f"assets/{name}.obj", _LIVER.tissue.mass_of(report.volume)
     files[root / mesh] = mjcf.obj(vertices, triangles, decimals=8)

@@ -64,11 +64,7 @@ class Edges:
 
 
 def remesh(
-  vertices: np.ndarray,
-  triangles: np.ndarray,
-  nodes: int,
-  project: Project,
-  iterations: int = 40,
+  vertices: np.ndarray, triangles: np.ndarray, nodes: int, project: Project, iterations: int = 40
 ) -> tuple[np.ndarray, np.ndarray]:
   """Returns an even mesh of the same closed surface with the given number of nodes.
 

@@ -117,9 +117,7 @@ class Scene:
     ] + clear
     for s in range(model.nsite):
       self._add_site(s)
-    self.texels, self.images = textures.pack(
-      [textures.image(model, k) for k in range(model.ntex)]
-    )
+    self.texels, self.images = textures.pack([textures.image(model, k) for k in range(model.ntex)])
     skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     self.sky = int(skies[0]) if len(skies) else -1
 

@@ -125,9 +125,7 @@ SUMMARY = Numbers(
 
 # Of the outbox: the node of a slot after a step that ended with the organ's response.
 ANSWER = Numbers(
-  "ANSWER",
-  ("disp", 3, "m", "displacement from rest"),
-  ("vel", 3, "m/s", "velocity"),
+  "ANSWER", ("disp", 3, "m", "displacement from rest"), ("vel", 3, "m/s", "velocity")
 )
 
 # Of the outbox: a node that is near the window's geoms.

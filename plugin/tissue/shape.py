@@ -24,12 +24,7 @@ _BEND_MORE = 4  # entries that a cut may add to a row of the bending matrix
 
 
 def make(
-  mesh: Mesh,
-  config: Config,
-  pinned: np.ndarray,
-  device: str,
-  scale: float = 0.0,
-  nworld: int = 1,
+  mesh: Mesh, config: Config, pinned: np.ndarray, device: str, scale: float = 0.0, nworld: int = 1
 ) -> Body:
   """Returns the body of an organ, at rest.
 

@@ -43,12 +43,7 @@ class Worlds:
   """
 
   def __init__(
-    self,
-    environment: Environment,
-    nworld: int,
-    device: str,
-    limit: int,
-    **options: Any,
+    self, environment: Environment, nworld: int, device: str, limit: int, **options: Any
   ):
     """Makes the worlds; `reset` is to come first.
 

@@ -146,9 +146,7 @@ def environment(recording: Recording) -> Environment:
 
 
 def replay(
-  recording: Recording,
-  watch: Callable[[Any], Any] | None = None,
-  env: Environment | None = None,
+  recording: Recording, watch: Callable[[Any], Any] | None = None, env: Environment | None = None
 ) -> Recording:
   """Returns a recording's episode run anew from its seed and actions.
 

@@ -120,9 +120,7 @@ class Instrument:
     tip, data, model = self.tip_pos(), self.data.ptr, self.model.ptr
     bodies = [model.body(name).id for name in self._jaws.names] if self._jaws else []
     end = model.site(f"{self.prefix}tip").pos
-    ends = [
-      data.xpos[b] - data.xmat[b].reshape(3, 3) @ (model.body_pos[b] - end) for b in bodies
-    ]
+    ends = [data.xpos[b] - data.xmat[b].reshape(3, 3) @ (model.body_pos[b] - end) for b in bodies]
     return np.stack([tip, *(ends or [tip, tip]), self._trocar.pos])
 
   def tip_vel(self) -> np.ndarray:

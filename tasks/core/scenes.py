@@ -133,9 +133,7 @@ def chosen(scene: Scene, input: str, nodes: int | None, surroundings: str | None
     nodes = scene.nodes
   if not (isinstance(nodes, int) and 100 <= nodes <= 20000):
     raise ValueError(f"nodes is {nodes!r}, expected a whole number in [100, 20000], or None")
-  return dataclasses.replace(
-    scene, input=input, nodes=nodes, surroundings=surroundings
-  )
+  return dataclasses.replace(scene, input=input, nodes=nodes, surroundings=surroundings)
 
 
 @functools.lru_cache(maxsize=32)

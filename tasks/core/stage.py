@@ -53,9 +53,7 @@ def compile_spec(spec: mj.MjSpec) -> mj.MjModel:
     return spec.compile()
 
 
-def build(
-  model: mj.MjModel, hands: Sequence[str], organ: str, settles: float = SETTLES
-) -> Stage:
+def build(model: mj.MjModel, hands: Sequence[str], organ: str, settles: float = SETTLES) -> Stage:
   """Returns the stage of a model, with an organ and the instruments of these prefixes.
 
   It is waited for the organ to come to rest, but no longer than `settles` [s].

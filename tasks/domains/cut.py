@@ -38,10 +38,7 @@ from ..core.rules import (  # isort: skip
 )  # fmt: skip
 
 SCENE = Scene(
-  organ="sheet",
-  instrument="scalpel",
-  port=(0.0, -0.025, 0.12),
-  camera=(-0.03, -0.07, 0.09),
+  organ="sheet", instrument="scalpel", port=(0.0, -0.025, 0.12), camera=(-0.03, -0.07, 0.09)
 )
 RULE = 0.002  # [m], of FLS
 ASTRAY = 0.01  # most that may be cut beyond the tolerance, slashed or dragged [m]

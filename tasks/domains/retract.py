@@ -135,14 +135,7 @@ class Retract(Hold):
   )  # fmt: skip
 
   def __init__(
-    self,
-    scene: Scene,
-    random=None,
-    *,
-    radius: float,
-    wanted: float,
-    hold: float,
-    **kwargs,
+    self, scene: Scene, random=None, *, radius: float, wanted: float, hold: float, **kwargs
   ):
     """Makes the task.
 

@@ -266,14 +266,7 @@ class Trace(Task):
   rules = Rules(State, advance, observe, ("target", "ahead"), shaping=shaping, mark=mark)
 
   def __init__(
-    self,
-    scene: Scene,
-    random=None,
-    *,
-    size: float,
-    turns: float,
-    tolerance: float,
-    **kwargs,
+    self, scene: Scene, random=None, *, size: float, turns: float, tolerance: float, **kwargs
   ):
     """Makes the task.
 

@@ -103,11 +103,7 @@ class Demonstration:
 
 
 def perform(
-  env: Environment,
-  act: Act,
-  seed: int,
-  info: Mapping[str, Any] | None = None,
-  noise: float = 0.0,
+  env: Environment, act: Act, seed: int, info: Mapping[str, Any] | None = None, noise: float = 0.0
 ) -> Demonstration:
   """Returns a new episode; what is not said here is as in `episode.run`.
 

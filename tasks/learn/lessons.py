@@ -151,9 +151,7 @@ class _Turns:
     helped: whether an expert had one
   """
 
-  def __init__(
-    self, env: Environment, random: np.random.RandomState, most: int | None, both: bool
-  ):
+  def __init__(self, env: Environment, random: np.random.RandomState, most: int | None, both: bool):
     self._env, self._random, self._most, self._both = env, random, most, both
     self._expert: Teacher | None = None
     self.helped = False

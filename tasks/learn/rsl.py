@@ -32,10 +32,7 @@ class RslRl(VecEnv):
   """
 
   def __init__(
-    self,
-    env: Exercises,
-    seed: int | None = None,
-    groups: Mapping[str, Sequence[str]] | None = None,
+    self, env: Exercises, seed: int | None = None, groups: Mapping[str, Sequence[str]] | None = None
   ):
     """Begins episodes in all worlds of an environment with `output="torch"`.
 

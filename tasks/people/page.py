@@ -76,10 +76,7 @@ def group(name: str, columns: int) -> str:
 
 
 def table(
-  head: Iterable[str],
-  rows: Iterable[str],
-  numbers: Iterable[int] = (),
-  more: Iterable[int] = (),
+  head: Iterable[str], rows: Iterable[str], numbers: Iterable[int] = (), more: Iterable[int] = ()
 ) -> str:
   """Returns a table of finished rows; see `row`."""
   first, rest = row(head, numbers, "th", more), "".join(rows)

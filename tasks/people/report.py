@@ -212,10 +212,7 @@ def _plots(recording: Recording, metrics: Metrics) -> str:
 
 
 def _metric_table(
-  recording: Recording,
-  metrics: Metrics,
-  reference: Mapping[str, Any] | None,
-  result: Score | None,
+  recording: Recording, metrics: Metrics, reference: Mapping[str, Any] | None, result: Score | None
 ) -> str:
   several = len(recording.instruments) > 1
   each = [recording.metrics(i) for i in range(len(recording.instruments))] if several else []

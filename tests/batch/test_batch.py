@@ -8,11 +8,7 @@ from devices import needs_cuda
 from scenes import RADIUS, drive, load, masses, press, probed
 from scenes.resting import block, resting
 
-BACKENDS = [
-  "cpu",
-  "warp-cpu",
-  pytest.param("cuda:0", marks=needs_cuda),
-]
+BACKENDS = ["cpu", "warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
 SKIN = {"capsule_young": 1e5, "thickness": 3e-4}
 
 

@@ -8,11 +8,7 @@ import pytest
 from devices import needs_cuda
 from scenes import box, servo, sphere, triangular
 
-BACKENDS = [
-  "cpu",
-  "warp-cpu",
-  pytest.param("cuda:0", marks=needs_cuda),
-]
+BACKENDS = ["cpu", "warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
 SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
 ROUND = np.linspace(0, 2 * np.pi, 60)
 CIRCLE = 0.05 * np.stack([0.4 * np.cos(ROUND), 0.4 * np.sin(ROUND), 0 * ROUND + 0.84**0.5], axis=1)

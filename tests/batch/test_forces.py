@@ -9,11 +9,7 @@ from devices import needs_cuda
 from palpate.batch import strip_organs
 from scenes import ball, box, load, sphere, windowed, workspace, world
 
-BACKENDS = [
-  "cpu",
-  "warp-cpu",
-  pytest.param("cuda:0", marks=needs_cuda),
-]
+BACKENDS = ["cpu", "warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
 BODIES = """<body name="bed" pos="0 0 -0.0605"><geom name="bed" type="box" size="0.1 0.1 0.01"
   contype="0" conaffinity="0"/></body>
   <body name="hand" pos="0 0 0.08"><joint type="slide" axis="1 0 0"/>

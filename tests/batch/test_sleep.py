@@ -7,10 +7,7 @@ import pytest
 from devices import needs_cuda
 from scenes import load, probed
 
-DEVICES = [
-  "warp-cpu",
-  pytest.param("cuda:0", marks=needs_cuda),
-]
+DEVICES = ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
 AWAY, DEEP = 0.02, -0.006  # where the probe waits, and is pressed to [m]
 
 

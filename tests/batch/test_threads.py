@@ -66,8 +66,7 @@ def test_a_pulled_thread_stretches_by_hooke(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
-  ("cone", "kind"),
-  [("elliptic", "capsule"), pytest.param("pyramidal", "cylinder", marks=SLOW)],
+  ("cone", "kind"), [("elliptic", "capsule"), pytest.param("pyramidal", "cylinder", marks=SLOW)]
 )
 def test_a_thread_around_a_drum_obeys_the_capstan_law(device, cone, kind):
   text = one.drum(0.3, cone, kind)

@@ -7,10 +7,7 @@ import pytest
 from devices import needs_cuda
 from scenes import RADIUS, load, organ, probed, sphere, world
 
-DEVICES = [
-  "warp-cpu",
-  pytest.param("cuda:0", marks=needs_cuda),
-]
+DEVICES = ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
 POINTS = "-1 -1 -3 1 -1 -3 1 1 -3 -1 1 -3 -1 -1 3 1 -1 3 1 1 3 -1 1 3"
 KINDS = {
   "sphere": 'size=".006"',

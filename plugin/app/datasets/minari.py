@@ -28,11 +28,7 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
   env = gymnasium.make(registry.gym_id(*about.task.split("/")), **kwargs)
   jpeg = not {"segmentation", "soiling"} & {*env.observation_space.spaces}  # labels are no colours
   storage = MinariStorage.new(
-    folder / "data",
-    env.observation_space,
-    env.action_space,
-    env.spec,
-    jpeg_encoding=jpeg,
+    folder / "data", env.observation_space, env.action_space, env.spec, jpeg_encoding=jpeg
   )
   version = importlib.metadata.version("minari")
   storage.update_metadata({

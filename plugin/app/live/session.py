@@ -141,9 +141,7 @@ class Session:
       self._rows[:] = 0.0
       self._held.clear()
       first, extras = 0, (task.extra, task.other)
-      for k, (hand, link, extra) in enumerate(
-        zip(physics.hands, self.links, extras, strict=False)
-      ):
+      for k, (hand, link, extra) in enumerate(zip(physics.hands, self.links, extras, strict=False)):
         handle, port = hand.handle, hand.trocar()
         shaft = Wrist(port, handle.quat) if port.wrist else Shaft(port)
         closed = port.wrist and "jaw" in extra and float(task.still(k)[0]) < 0

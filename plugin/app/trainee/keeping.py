@@ -197,10 +197,7 @@ class Sitting:
       return None, info
 
   def keep(
-    self,
-    recording: Recording,
-    before: Kept | None = None,
-    path: pathlib.Path | None = None,
+    self, recording: Recording, before: Kept | None = None, path: pathlib.Path | None = None
   ) -> Kept:
     """Keeps a recording, or else puts it among the temporary files.
 

@@ -71,10 +71,7 @@ class Pressed:
 
 
 _find_series = kernel(
-  "find_series",
-  "coupling/world_contacts.h",
-  Pressed,
-  coupling.CONSTANTS | TISSUE.constants(),
+  "find_series", "coupling/world_contacts.h", Pressed, coupling.CONSTANTS | TISSUE.constants()
 )
 
 

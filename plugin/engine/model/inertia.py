@@ -177,13 +177,7 @@ def _tool_radius(m: mjstruct.Struct, organ: Declaration, flex: int) -> float:
 
 
 def effective_inertia(
-  body: Body,
-  mesh: Mesh,
-  mass: np.ndarray,
-  free: np.ndarray,
-  h: float,
-  radius: float,
-  gain: float,
+  body: Body, mesh: Mesh, mass: np.ndarray, free: np.ndarray, h: float, radius: float, gain: float
 ) -> np.ndarray:
   """Returns the inertia that a contact meets at each node at rest [kg], (nvert,).
 

@@ -29,12 +29,7 @@ from ...core.rules import (  # isort: skip
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2]: ours, we know of no measurement.
 FILMY, DENSE = (1e7, 6e3, 6.0), (1e7, 8e3, 12.0)
-SCENE = Scene(
-  organ="adhesion",
-  nodes=250,
-  port=(0.0, -0.13, 0.065),
-  camera=(-0.07, -0.06, 0.06),
-)
+SCENE = Scene(organ="adhesion", nodes=250, port=(0.0, -0.13, 0.065), camera=(-0.07, -0.06, 0.06))
 # Of the expert: where the tip is over the bed and behind the front before a stroke, how far a
 # stroke goes beyond the front, how wide a lane is [m], and how fast a stroke and the way back are
 # [m/s]. Back faster, the tip leaves what it held up, and the strip falls on the shaft behind it.

@@ -454,10 +454,7 @@ def test_a_wrist_is_turned_by_mouse_keys_gamepad_and_buttons(pages):
       lambda: page.evaluate(f"void (window.pads = {pad})"),
       lambda: page.evaluate("void (window.pads = [])"),
     ),
-    (
-      lambda: page.dispatch_event(up, "pointerdown"),
-      lambda: page.dispatch_event(up, "pointerup"),
-    ),
+    (lambda: page.dispatch_event(up, "pointerdown"), lambda: page.dispatch_event(up, "pointerup")),
   ):
     before = np.array(page.evaluate(axes))
     page.keyboard.down("Shift")

@@ -137,8 +137,7 @@ def test_two_hands_move_two_instruments_and_what_they_do_replays(tmp_path):
   env = load("bimanual/easy", time_limit=0.6)
   right = live.Hand(lambda t: (0.0, 0.02 * t, 0.0))
   left = live.Hand(
-    lambda t: (0.02 * t, 0.0, 0.0),
-    buttons=lambda t: frozenset({"grip"} if t > 0.3 else ()),
+    lambda t: (0.02 * t, 0.0, 0.0), buttons=lambda t: frozenset({"grip"} if t > 0.3 else ())
   )
   made = session(env, right, other=left).run()
   first, second = made.columns["tip_pos"].transpose(1, 0, 2)

@@ -195,12 +195,7 @@ def summarize(rows: list[Row]) -> list[str]:
   lines += ["## Least run time [s] to an error level, over all h and settings", ""]
   head, table, lost = _race(found)
   lines += [*plots.table(head, table), ""]
-  lines += [
-    _SIDES,
-    "",
-    "A peer is faster: " + ("; ".join(lost) or "nowhere") + ".",
-    "",
-  ]
+  lines += [_SIDES, "", "A peer is faster: " + ("; ".join(lost) or "nowhere") + ".", ""]
   table = []
   for key, mine in found.items():
     at = {r["run"]: r for r in mine if abs(r["h"] - 1e-3) < 1e-9}

@@ -40,8 +40,7 @@ class FlatConformance(test_utils.EnvironmentTestMixin, absltest.TestCase):
 
 
 @pytest.mark.parametrize(
-  "arguments, step",
-  [({}, 0.02), ({"control_timestep": 0.05}, 0.05), ({"n_sub_steps": 10}, 0.01)],
+  "arguments, step", [({}, 0.02), ({"control_timestep": 0.05}, 0.05), ({"n_sub_steps": 10}, 0.01)]
 )
 def test_control_timestep_and_sub_steps(arguments, step):
   env = load("touch/easy", arguments, time_limit=0.2)

@@ -158,9 +158,7 @@ def test_blur_smears_and_blood_covers():
   assert np.flatnonzero(smeared.sum(axis=1)).tolist() == [20]
   grey = np.full((40, 60, 3), 100, np.uint8)
   empty = np.zeros((40, 60, 2), np.uint8)
-  seen = looked_at(
-    {"pixels": grey, "soiling": empty}, veil=0.4, blood=4.5, exposure=1.2
-  )
+  seen = looked_at({"pixels": grey, "soiling": empty}, veil=0.4, blood=4.5, exposure=1.2)
   smoke, blood = np.moveaxis(seen["soiling"] / 255, 2, 0)
   np.testing.assert_allclose(smoke, 0.4, atol=1 / 255)
   assert 0.02 < (blood > 0.5).mean() < 0.4 and (blood == 0).mean() > 0.3

@@ -38,9 +38,7 @@ def test_table_is_consistent():
     assert spec.source and spec.label, name
   assert (METRICS["path_length"].shown, METRICS["path_length"].scale) == ("mm", 1000)
   assert METRICS["angular_path"].scale * math.pi == pytest.approx(180)
-  assert {n for n, s in METRICS.items() if s.better == "higher"} == {
-    "log_dimensionless_jerk",
-  }
+  assert {n for n, s in METRICS.items() if s.better == "higher"} == {"log_dimensionless_jerk"}
   shown = {"mean_speed", "economy_of_volume", "sparc", "bimanual_dexterity", "share_freed"}
   shown |= {"bite_depth", "knot_security"}
   assert set(METRICS) - set(SCORED) == shown
