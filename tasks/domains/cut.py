@@ -28,14 +28,32 @@ from palpate.tissue.types import Array, ints
 
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
+from ..core.rules import (
+  DAMAGED,
+  FAR,
+  HIDDEN,
+  LATER,
+  NOW,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  Vectors3,
+  closeness,
+  cutter,
+  length,
+  many,
+  miss,
+  pieces,
+  root,
+  rows,
+  tip,
+  tissue_force,
+  vector,
+)
 from ..core.scenes import Scene
 from ..registry import exercise
 from . import sheet
-
-from ..core.rules import (  # isort: skip
-  DAMAGED, FAR, HIDDEN, LATER, NOW, RUNNING, SUCCESS, Rules, Vector, Vectors3, closeness, cutter,
-  length, many, miss, pieces, root, rows, tip, tissue_force, vector,
-)  # fmt: skip
 
 SCENE = Scene(
   organ="sheet", instrument="scalpel", port=(0.0, -0.025, 0.12), camera=(-0.03, -0.07, 0.09)

@@ -33,14 +33,33 @@ import numpy as np
 
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
+from ..core.rules import (
+  LATER,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  clamp,
+  closeness,
+  closing,
+  dot,
+  drop,
+  from_tip,
+  grip,
+  holds,
+  length,
+  miss,
+  opening,
+  peak,
+  pinch,
+  point,
+  root,
+  slipped,
+  tip,
+)
 from ..core.scenes import Scene
 from ..registry import exercise
 from .touch import SLACK
-
-from ..core.rules import (  # isort: skip
-  LATER, RUNNING, SUCCESS, Rules, Vector, clamp, closeness, closing, dot, drop, from_tip, grip,
-  holds, length, miss, opening, peak, pinch, point, root, slipped, tip,
-)  # fmt: skip
 
 FUNDUS = Scene(
   organ="gallbladder",

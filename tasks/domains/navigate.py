@@ -29,14 +29,32 @@ from palpate.tissue.types import Array, ints
 
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
+from ..core.rules import (
+  HIDDEN,
+  LATER,
+  NOW,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  angle,
+  closeness,
+  dot,
+  drop,
+  guide,
+  guided_tip,
+  length,
+  lens,
+  normal,
+  picture,
+  point,
+  root,
+  sine,
+  vector,
+)
 from ..core.scenes import Scene
 from ..registry import exercise
 from .touch import SLACK, draw_apart
-
-from ..core.rules import (  # isort: skip
-  HIDDEN, LATER, NOW, RUNNING, SUCCESS, Rules, Vector, angle, closeness, dot, drop, guide,
-  guided_tip, length, lens, normal, picture, point, root, sine, vector,
-)  # fmt: skip
 
 FOVY = math.radians(50.0)  # of the laparoscope
 ABOVE, PIN = 0.004, 0.014  # of a mark over the surface, and of the end of its pin over the mark [m]

@@ -25,14 +25,25 @@ from palpate.tissue.types import Array
 
 from ..core.base import Physics
 from ..core.performer import Performer, Script
+from ..core.rules import (
+  LATER,
+  NOW,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  clamp,
+  dot,
+  drop,
+  peak,
+  point,
+  tip,
+  visible,
+)
 from ..core.scenes import Scene
 from ..registry import exercise
 from .grasp import FUNDUS, READY, Held, Hold, follow, near, ready
 from .touch import SLACK
-
-from ..core.rules import (  # isort: skip
-  LATER, NOW, RUNNING, SUCCESS, Rules, Vector, clamp, dot, drop, peak, point, tip, visible,
-)  # fmt: skip
 
 _BEHIND = 0.02  # from the organ's middle to the disc [m]
 SAMPLES = 12  # points of the disc

@@ -18,13 +18,25 @@ from palpate.tissue.types import ints
 
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
+from ..core.rules import (
+  HIDDEN,
+  LATER,
+  NOW,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  closeness,
+  length,
+  miss,
+  normal,
+  peak,
+  point,
+  reach,
+  tip,
+)
 from ..core.scenes import Scene
 from ..registry import exercise
-
-from ..core.rules import (  # isort: skip
-  HIDDEN, LATER, NOW, RUNNING, SUCCESS, Rules, Vector, closeness, length, miss, normal, peak, point,
-  reach, tip,
-)  # fmt: skip
 
 CONTACT, DWELL = 0.03, 0.1  # least force and time of a touch [N], [s]
 SLACK = 1e-5  # what rounding may take from times [s]

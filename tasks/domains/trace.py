@@ -24,13 +24,30 @@ from scipy.spatial import cKDTree
 
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
+from ..core.rules import (
+  FAR,
+  HIDDEN,
+  LATER,
+  NOW,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  Vectors3,
+  clamp,
+  closeness,
+  corner,
+  dot,
+  drop,
+  force,
+  length,
+  many,
+  miss,
+  rows,
+  tip,
+)
 from ..core.scenes import Scene
 from ..registry import exercise
-
-from ..core.rules import (  # isort: skip
-  FAR, HIDDEN, LATER, NOW, RUNNING, SUCCESS, Rules, Vector, Vectors3, clamp, closeness, corner, dot,
-  drop, force, length, many, miss, rows, tip,
-)  # fmt: skip
 
 STOMACH = Scene(organ="stomach", center="body", port=(0.03, 0.045, 0.12), camera=(-0.05, 0.1, 0.14))
 CONTACT = 0.02  # [N]

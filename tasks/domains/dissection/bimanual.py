@@ -27,17 +27,32 @@ from palpate.engine.cutting.trails import SPARK
 
 from ...core.base import Physics
 from ...core.performer import Performer, Script
+from ...core.rules import (
+  DAMAGED,
+  FAR,
+  RUNNING,
+  Rules,
+  Vector,
+  bond,
+  bonds,
+  dot,
+  is_free,
+  last_component,
+  length,
+  many,
+  other_force,
+  other_point,
+  other_tip,
+  point,
+  strand_distance,
+  weaken,
+)
 from ...registry import exercise
 from ..grasp import FUNDUS
 from . import dissect
 from .dissect import Dissect, hold, middle
 from .dissect import observe as look
 from .freeing import METRICS, count, earned, ruined
-
-from ...core.rules import (  # isort: skip
-  DAMAGED, FAR, RUNNING, Rules, Vector, bond, bonds, dot, is_free, last_component, length, many,
-  other_force, other_point, other_tip, point, strand_distance, weaken,
-)  # fmt: skip
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed; ours, we know of no measurement. A
 # pull within the limits does not free it.

@@ -22,14 +22,25 @@ import numpy as np
 
 from ...core.base import Physics
 from ...core.performer import Performer, Script
+from ...core.rules import (
+  NOW,
+  Rules,
+  Vector,
+  bond,
+  bonds,
+  closeness,
+  drop,
+  is_free,
+  length,
+  many,
+  point,
+  tip,
+  vector,
+)
 from ...core.scenes import Scene
 from ...registry import exercise
 from ..grasp import FUNDUS, Held, Hold, distance, follow
 from .freeing import METRICS, Freed, Freeing, count, earned, held, holding
-
-from ...core.rules import (  # isort: skip
-  NOW, Rules, Vector, bond, bonds, closeness, drop, is_free, length, many, point, tip, vector,
-)  # fmt: skip
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed, and of a tough one. Ours: we know
 # of no measurement; the bed bears the organ, and comes away under half a newton or one.

@@ -5,11 +5,18 @@ import math
 import numpy as np
 
 from ...core.base import Physics, Task
+from ...core.rules import (
+  DAMAGED,
+  RUNNING,
+  SUCCESS,
+  bonds,
+  is_free,
+  peak,
+  share_freed,
+  tear,
+  traction,
+)
 from ...core.scenes import FILM, RAW, Scene, films
-
-from ...core.rules import (  # isort: skip
-  DAMAGED, RUNNING, SUCCESS, bonds, is_free, peak, share_freed, tear, traction,
-)  # fmt: skip
 
 SEEN = 1e-5  # what rounding may take from a share, in float32 too
 

@@ -18,14 +18,24 @@ import numpy as np
 
 from ...core.base import Physics
 from ...core.performer import Performer, Script
+from ...core.rules import (
+  FAR,
+  NOW,
+  Rules,
+  Vector,
+  bond,
+  bonds,
+  closeness,
+  is_free,
+  length,
+  many,
+  tip,
+  vector,
+)
 from ...core.scenes import Scene
 from ...registry import exercise
 from . import adhesion
 from .freeing import METRICS, Freed, Freeing, count, earned, held, holding
-
-from ...core.rules import (  # isort: skip
-  FAR, NOW, Rules, Vector, bond, bonds, closeness, is_free, length, many, tip, vector,
-)  # fmt: skip
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2]: ours, we know of no measurement.
 FILMY, DENSE = (1e7, 6e3, 6.0), (1e7, 8e3, 12.0)

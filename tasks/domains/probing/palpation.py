@@ -15,14 +15,26 @@ from scipy.spatial import cKDTree
 from ...core import scenes
 from ...core.base import Physics, Task
 from ...core.performer import Performer, Script
+from ...core.rules import (
+  HIDDEN,
+  LATER,
+  MISSED,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  ended,
+  force,
+  last_component,
+  length,
+  many,
+  miss,
+  reach,
+  tip,
+)
 from ...core.scenes import Scene
 from . import feeling
 from .feeling import APART, SHARED, SOFT, Notes, chance, nearest, press, sure
-
-from ...core.rules import (  # isort: skip
-  HIDDEN, LATER, MISSED, RUNNING, SUCCESS, Rules, Vector, ended, force, last_component, length,
-  many, miss, reach, tip,
-)  # fmt: skip
 
 _FACING = 0.75  # least cosine between the field's normal and the way to the trocar
 _PIN_GAP = 0.02  # the field keeps that far from pinned nodes [m]

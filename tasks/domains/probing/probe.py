@@ -32,15 +32,29 @@ from palpate.tissue.types import Array, ints
 
 from ...core.base import Physics, Task
 from ...core.performer import Performer, Script
+from ...core.rules import (
+  HIDDEN,
+  LATER,
+  NOW,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  clamp,
+  closeness,
+  dot,
+  force,
+  length,
+  miss,
+  normal,
+  reach,
+  root,
+  tip,
+)
 from ...core.scenes import Scene
 from ...registry import exercise
 from ..touch import SLACK, draw_apart
 from .palpation import Palpate
-
-from ...core.rules import (  # isort: skip
-  HIDDEN, LATER, NOW, RUNNING, SUCCESS, Rules, Vector, clamp, closeness, dot, force, length, miss,
-  normal, reach, root, tip,
-)  # fmt: skip
 
 KIDNEY = Scene(
   organ="kidney", center="anterior", port=(0.03, 0.045, 0.12), camera=(-0.05, 0.12, 0.1)
