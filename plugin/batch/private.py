@@ -1,5 +1,9 @@
 """What batches need of mujoco_warp's private modules, since its public ones lack it."""
 
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
 from mujoco_warp._src import passive, sensor, solver, support
 from mujoco_warp._src.collision_core import Geom
 from mujoco_warp._src.collision_gjk import ccd
@@ -26,10 +30,24 @@ from mujoco_warp._src.types import (
 __all__ = [
   "MJ_MAX_EPAFACES", "MJ_MAX_EPAHORIZON", "ConstraintState", "ConstraintType", "ContactType",
   "DeterminismType", "Geom", "GeomType", "OverflowType", "box_triangle", "capsule_triangle", "ccd",
-  "contact_kbimp", "jac_dof", "passive", "ray_geom", "sensor", "solver", "sphere_triangle", "vec5",
+  "contact_kbimp", "instead", "jac_dof", "passive", "ray_geom", "sensor", "solver",
+  "sphere_triangle", "vec5",
 ]  # fmt: skip
 
 # Large functions with many callers: inlined, they made kernels of contacts with flexes, of which we
 # need neither interpolated ones nor boxes of rods, take a minute to compile on CUDA.
 for _each in (support.add_flex_interp_weights, support.contact_bodies_and_weights):
   _each.inline_hint = "noinline"
+
+
+@contextlib.contextmanager
+def instead(changes: list[tuple[Any, str, Any]]) -> Iterator[None]:
+  """Lets attributes of mujoco_warp's, (owner, name, value), be others within."""
+  kept = [(owner, name, getattr(owner, name)) for owner, name, _ in changes]
+  try:
+    for change in changes:
+      setattr(*change)
+    yield
+  finally:
+    for change in kept:
+      setattr(*change)

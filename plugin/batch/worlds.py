@@ -26,6 +26,7 @@ from . import host, kernels, rods, states, strip_organs
 from .base import Batch
 from .contact import contacts, convex
 from .contact.fixed_order import FixedOrder, is_enough
+from .contact.rounding import Rounding
 from .organs import Organ
 from .private import DeterminismType, OverflowType
 from .reset import Rest
@@ -174,6 +175,7 @@ class Worlds(Batch):
       self.m.opt.tolerance.fill_(_FINE)
     ordered = deterministic and not sewn and is_enough(self.m, bare)
     self._order = FixedOrder(self.m, self.d) if ordered else None
+    self._rounding = Rounding(self.m, self.d) if sewn else None
     sorted_by_warp = deterministic and not ordered
     self.m.opt.deterministic = int(DeterminismType.ALL if sorted_by_warp else DeterminismType.NONE)
     # The windows' triangles have no forces and contacts of mujoco_warp's own, threads no forces.
@@ -255,7 +257,8 @@ class Worlds(Batch):
 
   def step_tools(self):
     """Launches mujoco_warp's step, with the windows' contacts."""
-    with self._order.adding() if self._order else contextlib.nullcontext():
+    each = self._order or self._rounding
+    with each.adding() if each else contextlib.nullcontext():
       mjw.step(self.m, self.d)
 
   def end(self):

@@ -14,7 +14,7 @@ of every kernel and sorts them all.
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -514,8 +514,7 @@ class FixedOrder:
     )  # fmt: skip
     solver._cholesky_factorize_solve(m, d, ctx)
 
-  @contextlib.contextmanager
-  def adding(self) -> Iterator[None]:
+  def adding(self) -> contextlib.AbstractContextManager[None]:
     """Lets what mujoco_warp launches within add up in order."""
     solver, sensor = private.solver, private.sensor
     evaluate = sensor.sensor_acc
@@ -525,7 +524,7 @@ class FixedOrder:
       wp.launch(_touch, dim=dim, inputs=[self._rows, self._touches])
       evaluate(m, d, *args, **kwargs)
 
-    instead: list[tuple[Any, str, Any]] = [
+    return private.instead([
       (solver, "_use_incremental", lambda m: False),
       (solver, "_update_constraint", self._update_constraint),
       (solver, "_update_gradient", self._update_gradient),
@@ -533,12 +532,4 @@ class FixedOrder:
       (sensor, "_contact_sort", sort_matches),
       (sensor, "sensor_acc", feel),
       (self._model, "sensor_touch_adr", self._none),
-    ]
-    kept = [(owner, name, getattr(owner, name)) for owner, name, _ in instead]
-    try:
-      for change in instead:
-        setattr(*change)
-      yield
-    finally:
-      for change in kept:
-        setattr(*change)
+    ])  # fmt: skip
