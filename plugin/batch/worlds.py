@@ -24,6 +24,7 @@ from palpate.tissue import device as devices
 
 from . import host, kernels, rods, states, strip_organs
 from .base import Batch
+from .compiling import compile_ahead
 from .contact import contacts, convex
 from .contact.fixed_order import FixedOrder, is_enough
 from .contact.rounding import Rounding
@@ -303,7 +304,8 @@ class Worlds(Batch):
         each.load()
       self._graphs = {name: (None, each) for name, each in work.items()}
       return
-    if not self._graphs:  # loads the kernels; what it does to the worlds, their first reset undoes
+    if not self._graphs:  # what this does to the worlds, their first reset undoes
+      compile_ahead(self.device, work.values())
       for each in work.values():
         each()
     for name, each in work.items():

@@ -5,6 +5,7 @@ import numpy as np
 import palpate
 import palpate.batch
 import pytest
+from benchmarks.timing import batch as timing
 from devices import needs_cuda
 from palpate.tasks.core import stage
 from palpate.tasks.core.scenes import Scene
@@ -59,3 +60,19 @@ def test_many_worlds_have_the_scene_of_fls(device):
   nodes = batch.organ("organ").xpos.numpy()
   np.testing.assert_allclose(nodes, np.stack([organ.xpos] * 2), atol=2e-5)
   assert batch.organ("organ").needles.count.numpy().tolist() == [[2], [2]]
+
+
+@pytest.mark.slow
+def test_worlds_go_on_where_needle_drivers_jump_into_the_thread():
+  """A jaw's contacts are a million times as stiff as the nodes are heavy: float32 has no factors."""
+  spec, data, _ = timing.knots(400)
+  batch = palpate.batch.make(spec, 4, "warp-cpu")
+  batch.start(data)
+  batch.reset()
+  random, (low, high) = np.random.default_rng(0), batch.model.actuator_ctrlrange.T
+  for _ in range(15):
+    jump = 0.5 * (low + (high - low) * random.random((4, len(low))))
+    batch.ctrl = jump.astype(np.float32)
+    batch.step(20)
+  assert not batch.failures.numpy().any()
+  assert np.isfinite(batch.thread(drain.THREAD).xpos.numpy()).all()

@@ -1,0 +1,42 @@
+"""Compiles the kernels of a step before it is taken, several at a time.
+
+Launched one after the other, each is compiled as it is met: minutes on a GPU's first step.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import warp as wp
+
+from .private import instead
+
+
+def compile_ahead(device: wp.Device, works: Iterable[Callable[[], Any]]):
+  """Compiles and loads the kernels that some callables launch, which it lets them only name.
+
+  What they copy and fill is done.
+  """
+  found: dict[tuple[Any, int | None], None] = {}
+
+  def note(kernel, *args, block_dim: int | None = None, **kwargs):
+    if not kernel.is_generic:  # these are known by what they are launched with
+      found[kernel.module, block_dim] = None
+
+  def once(condition, while_body, **kwargs):
+    while_body(**kwargs)
+
+  names = [(wp, "launch", note), (wp, "launch_tiled", note), (wp, "capture_while", once)]
+  with instead(names):
+    for work in works:
+      work()
+  default = 256 if device.is_cuda else 1  # as where a launch says nothing
+  with ThreadPoolExecutor(os.cpu_count()) as pool:
+    for loading in [
+      pool.submit(wp.force_load, device, [module], block_dim or default)
+      for module, block_dim in found
+    ]:
+      loading.result()
