@@ -64,7 +64,7 @@ def test_many_worlds_have_the_scene_of_fls(device):
 
 @pytest.mark.slow
 def test_worlds_go_on_where_needle_drivers_jump_into_the_thread():
-  """A jaw's contacts are a million times as stiff as the nodes are heavy: float32 has no factors."""
+  """Its nodes are a millionth of what a jaw's contacts are stiff: float32 finds no factors."""
   spec, data, _ = timing.knots(400)
   batch = palpate.batch.make(spec, 4, "warp-cpu")
   batch.start(data)
