@@ -7,6 +7,9 @@ before they fall by less than the tolerance that threads at rest need: then a wo
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportCallIssue=false
+# pyright: reportArgumentType=false, reportOperatorIssue=false, reportAssignmentType=false
+# pyright: reportGeneralTypeIssues=false
 import contextlib
 from typing import Any
 
