@@ -5,14 +5,16 @@ Launched one after the other, each is compiled as it is met: minutes on a GPU's 
 
 from __future__ import annotations
 
+import collections
 import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
 
 from .private import instead
+
+_BLOCK = 256  # threads of a block on CUDA where a launch does not say
 
 
 def compile_ahead(device: wp.Device, works: Iterable[Callable[[], Any]]):
@@ -20,23 +22,17 @@ def compile_ahead(device: wp.Device, works: Iterable[Callable[[], Any]]):
 
   What they copy and fill is done.
   """
-  found: dict[tuple[Any, int | None], None] = {}
+  found: dict[int, dict[Any, None]] = collections.defaultdict(dict)
 
   def note(kernel, *args, block_dim: int | None = None, **kwargs):
     if not kernel.is_generic:  # these are known by what they are launched with
-      found[kernel.module, block_dim] = None
+      found[block_dim or _BLOCK][kernel.module] = None
 
   def once(condition, while_body, **kwargs):
     while_body(**kwargs)
 
-  names = [(wp, "launch", note), (wp, "launch_tiled", note), (wp, "capture_while", once)]
-  with instead(names):
+  with instead([(wp, "launch", note), (wp, "launch_tiled", note), (wp, "capture_while", once)]):
     for work in works:
       work()
-  default = 256 if device.is_cuda else 1  # as where a launch says nothing
-  with ThreadPoolExecutor(os.cpu_count()) as pool:
-    for loading in [
-      pool.submit(wp.force_load, device, [module], block_dim or default)
-      for module, block_dim in found
-    ]:
-      loading.result()
+  for block_dim, modules in found.items():
+    wp.force_load(device, [*modules], block_dim, max_workers=os.cpu_count())

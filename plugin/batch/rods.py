@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _EACH = 2  # contacts of an edge with geoms, and as many more of a thread
 _BEYOND = 16
 _LANES = 32  # threads of a world
+_ITERATIONS = 60  # of a step, at most: all worlds wait for the one that takes longest
 
 
 @theirs(
@@ -100,6 +101,7 @@ class Thread(base.Thread):
     own_dof[dofs[organ.free]] = 3 * moving + np.arange(3)
     mass = space.mass
     shared = space.constants | rods.settings(organ, space.friction) | {"mass": mass}
+    shared["newton"] = min(shared["newton"], _ITERATIONS)
     self.twist, self.broken, self.force = (
       wp.zeros((nworld, n, *more), dtype=wp.float64, device=device) for more in ((), (), (3,))
     )

@@ -14,6 +14,7 @@ import contextlib
 from typing import Any
 
 import warp as wp
+from palpate.tissue.types import Array, fill, floats, ints, struct
 
 from .. import private
 from ..private import ConstraintState
@@ -23,48 +24,62 @@ _SATISFIED = wp.constant(int(ConstraintState.SATISFIED))
 _ROUNDED = wp.constant(2.0**-48)  # square of what float32 rounds off
 
 
+@struct
+class Search:
+  """What an iteration of mujoco_warp's solver has found."""
+
+  done: Array(wp.bool, ("nworld",))  # worlds that have arrived
+  h: floats("nworld", "npad", "npad")  # the matrix, before its factors take its place
+  diagonal: floats("nworld", "nv")  # of that
+  grad: floats("nworld", "nv")
+  search: floats("nworld", "nv")
+  square: floats("nworld")  # of the search
+  decrement: floats("nworld")  # twice what the search is to gain
+  # Rows of constraints:
+  nefc: ints("nworld")
+  state: ints("nworld", "njmax")
+  D: floats("nworld", "njmax")
+  aref: floats("nworld", "njmax")
+
+
 @wp.kernel(enable_backward=False)
-def _keep_diagonal(h: wp.array3d[float], done: wp.array[bool], diagonal: wp.array2d[float]):
-  """Keeps the diagonal of the matrix, which its factors take the place of."""
+def _keep_diagonal(s: Search):
+  """Keeps the diagonal of the matrix."""
   w, i = wp.tid()
-  if not done[w]:
-    diagonal[w, i] = h[w, i, i]
+  if not s.done[w]:
+    s.diagonal[w, i] = s.h[w, i, i]
 
 
 @wp.kernel(enable_backward=False)
-def _check(
-  nefc: wp.array[int], state: wp.array2d[int], D: wp.array2d[float], aref: wp.array2d[float],
-  grad: wp.array2d[float], diagonal: wp.array2d[float], done: wp.array[bool],
-  search: wp.array2d[float], square: wp.array[float], decrement: wp.array[float],
-):  # fmt: skip
+def _check(s: Search):
   """Gives worlds whose matrix had no factors another search, and tells those that have arrived.
 
   Forces D (J a - aref) are off by their reference's last digit, and so is the gradient: what is to
   be gained by that is no more than the sum of D aref^2 times the square of the digit.
   """
   w, lane = wp.tid()
-  if done[w]:
+  if s.done[w]:
     return
   lanes = wp.block_dim()
-  found = wp.isfinite(square[w]) and wp.isfinite(decrement[w])
+  found = wp.isfinite(s.square[w]) and wp.isfinite(s.decrement[w])
   mine = wp.vec2(0.0, 0.0)
   if found:
-    for k in range(lane, wp.min(nefc[w], D.shape[1]), lanes):
-      if state[w, k] != _SATISFIED:
-        mine[0] += D[w, k] * aref[w, k] * aref[w, k]
+    for k in range(lane, wp.min(s.nefc[w], s.D.shape[1]), lanes):
+      if s.state[w, k] != _SATISFIED:
+        mine[0] += s.D[w, k] * s.aref[w, k] * s.aref[w, k]
   else:
-    for i in range(lane, diagonal.shape[1], lanes):
-      step = -grad[w, i] / diagonal[w, i]
-      search[w, i] = step
-      mine += wp.vec2(step * step, -step * grad[w, i])
+    for i in range(lane, s.diagonal.shape[1], lanes):
+      step = -s.grad[w, i] / s.diagonal[w, i]
+      s.search[w, i] = step
+      mine += wp.vec2(step * step, -step * s.grad[w, i])
   total = wp.tile_reduce(wp.add, wp.tile(mine, preserve_type=True))[0]
   if lane > 0:
     return
   if not found:
-    square[w] = total[0]
-    decrement[w] = total[1]
-  elif decrement[w] < _ROUNDED * total[0]:
-    decrement[w] = 0.0
+    s.square[w] = total[0]
+    s.decrement[w] = total[1]
+  elif s.decrement[w] < _ROUNDED * total[0]:
+    s.decrement[w] = 0.0
 
 
 class Rounding:
@@ -78,15 +93,14 @@ class Rounding:
     factorize = private.solver._cholesky_factorize_solve
 
     def checked(m, d, ctx, *args, **kwargs):
-      efc, kept = d.efc, self._diagonal
-      wp.launch(_keep_diagonal, dim=kept.shape, inputs=[ctx.h, ctx.done], outputs=[kept])
+      kept, efc = self._diagonal, d.efc
+      found = fill(Search, kept.device, dict(
+        done=ctx.done, h=ctx.h, diagonal=kept, grad=ctx.grad, search=ctx.search,
+        square=ctx.search_dot, decrement=ctx.newton_decrement, nefc=d.nefc, state=efc.state,
+        D=efc.D, aref=efc.aref,
+      ))  # fmt: skip
+      wp.launch(_keep_diagonal, dim=kept.shape, inputs=[found], device=kept.device)
       factorize(m, d, ctx, *args, **kwargs)
-      wp.launch_tiled(
-        _check,
-        dim=d.nworld,
-        inputs=[d.nefc, efc.state, efc.D, efc.aref, ctx.grad, kept, ctx.done],
-        outputs=[ctx.search, ctx.search_dot, ctx.newton_decrement],
-        block_dim=_BLOCK,
-      )
+      wp.launch_tiled(_check, dim=d.nworld, inputs=[found], device=kept.device, block_dim=_BLOCK)
 
     return private.instead([(private.solver, "_cholesky_factorize_solve", checked)])
