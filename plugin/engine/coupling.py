@@ -217,7 +217,8 @@ class Ties:
 
   Attributes:
     arrays: arrays of `Rod` by name, a row a world
-    aims: launches that add to them, by who does
+    span: the least and the greatest place on it that is held [m]  (nworld, 2)
+    aims: by who holds it, what adds to these, and what follows once all have
     lead: lets the thread take its step before an organ's, given that's instance
     led: whether it has
   """
@@ -230,7 +231,9 @@ class Ties:
       name: wp.zeros((nworld, *shape), dtype=kind, device=device)
       for name, (shape, kind) in kinds.items()
     }
-    self.aims: dict[Any, Callable[[], None]] = {}
+    self._none = wp.array(np.tile([np.inf, -np.inf], (nworld, 1)), dtype=wp.float64, device=device)
+    self.span = wp.clone(self._none)
+    self.aims: dict[Any, tuple[Callable[[], None], Callable[[], None]]] = {}
     self.lead: Callable[[int], None] = lambda instance: None
     self.led = False
 
@@ -238,8 +241,10 @@ class Ties:
     """Fills the arrays."""
     if self.aims:
       self.arrays["tie_count"].zero_()
-      for each in self.aims.values():
-        each()
+      wp.copy(self.span, self._none)
+      for phase in range(2):
+        for each in self.aims.values():
+          each[phase]()
 
 
 _ties: dict[tuple[int, int], Ties] = {}

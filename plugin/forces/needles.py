@@ -91,12 +91,13 @@ class Held:
   tie_count: ints("nworld", 1)  # see `coupling.Ties`
   tie_edge: ints("nworld", "ntie")
   tie_value: doubles("nworld", "ntie", len(TIE))
+  span: doubles("nworld", 2)
 
 
 _enter, _act, _keep = kernels(
   "forces/needles.h", Pierced, "enter_needles", "act_needles", "keep_needles"
 )
-_aim, _feel = kernels("forces/needles.h", Held, "aim_thread", "feel_thread")
+_aim, _lift, _feel = kernels("forces/needles.h", Held, "aim_thread", "lift_thread", "feel_thread")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -290,15 +291,16 @@ class Needles(Force):
     host = self.host
     ties, first = host.ties(thread["flex"]), host.zeros(dtype=int)
     frame = {"frame": thread["frame"], "origin": thread["origin"]}
-    held = host.fill(Held, {"pierced": self.fields, "first": first} | frame | ties.arrays)
+    given = {"pierced": self.fields, "first": first, "span": ties.span}
+    held = host.fill(Held, given | frame | ties.arrays)
     self._held[k] = held
     host.load(_aim)
 
-    def aim():
-      host.launch(_aim, held, self.count, k)
+    def lift():
+      host.launch(_lift, held, self.count, k)
       host.open_contacts()
 
-    ties.aims[host.instance, k] = aim
+    ties.aims[host.instance, k] = (lambda: host.launch(_aim, held, self.count, k)), lift
 
   @property
   def sews(self) -> bool:

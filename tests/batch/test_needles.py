@@ -11,6 +11,7 @@ from scenes import press
 DEVICES = ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
 SLOW = pytest.mark.slow
 COARSE = {"mesh": one.sheet(9)[0], "pin": one.sheet(9)[1], "tilt": 1.1}  # edges of 5 mm
+APART = {"contype": 1, "conaffinity": 0}  # organs that touch needles, and not each other
 
 
 def scene(device: str, nworld: int = 2, **given):
@@ -69,6 +70,49 @@ def test_a_needle_goes_through_a_sheet_and_back_as_under_the_plugin(device, free
   assert {(True, 0), (False, 1)} <= set(seen)
   assert not organ.pinholes
   assert not worlds.failures.numpy().any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_needle_goes_through_a_wall_of_two_layers_as_under_the_plugin(device):
+  """Each layer has its own toughness and holes."""
+  spec = one.wall(free=True, contact=APART, **COARSE)
+  model, data, organ = one.load(spec)
+  worlds, lower = palpate.batch.make(spec, 2, device), palpate.Organ(model, data, "lower")
+  for k in drive(model, data, worlds, [1.5]):
+    if k % 10 == 9:
+      compare(organ, worlds, 5e-4)
+      compare(lower, worlds, 5e-4)
+  assert len(organ.pinholes) == len(lower.pinholes) == 1
+  assert not worlds.failures.numpy().any()
+
+
+@SLOW
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_thread_through_both_layers_of_a_wall_is_held_as_under_the_plugin(device):
+  """Both hold it, and neither touches it in between."""
+  spec = one.wall(nodes=16, pos=(0.017, 0, 0), contact=APART)
+  model, data, organ = one.load(spec)
+  lower = palpate.Organ(model, data, "lower")
+  one.drive(model, data, organ, [4.6])
+  mujoco.mj_step(model, data, 300)
+  worlds = palpate.batch.make(spec, 2, device)
+  worlds.set_state(1, data)
+  worlds.ctrl = np.tile(data.ctrl, (2, 1))
+  at = worlds.bare.body("suture_15").id
+  for k in range(30):
+    data.body("suture_15").xfrc_applied[1] = 5e-3 * k
+    applied = worlds.d.xfrc_applied.numpy()
+    applied[1, at, 1] = 5e-3 * k
+    worlds.d.xfrc_applied.assign(applied)
+    mujoco.mj_step(model, data)
+    worlds.step()
+    for each in (organ, lower):
+      (hole,) = each.pinholes
+      assert hole.thread
+      found = worlds.organ(each.name).needles
+      np.testing.assert_allclose(found.hole_force.numpy()[1, 0, 0], hole.force, atol=0.02)
+      np.testing.assert_allclose(found.hole_along.numpy()[1, 0, 0], hole.along, atol=5e-5)
+  assert worlds.organ("lower").needles.count.numpy().tolist() == [[0], [1]]
 
 
 @pytest.mark.parametrize("device", DEVICES)

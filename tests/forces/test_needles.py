@@ -9,8 +9,8 @@ from scenes.needles import (
   ENERGY,
   FRICTION,
   LENGTH,
+  LOWER,
   RADIUS,
-  SHEET,
   SLIT,
   STEP,
   THICK,
@@ -19,6 +19,7 @@ from scenes.needles import (
   load,
   scene,
   sheet,
+  wall,
 )
 
 
@@ -145,17 +146,32 @@ def test_insertions_are_those_of_the_published_model():
   assert found == pytest.approx(toughness, abs=6)
 
 
-def test_two_sheets_are_sewn_through():
-  """A needle that goes through both has a hole in each."""
-  spec = scene(height=0.005)
-  surface, pin = sheet()
-  more = SHEET | {"pin": pin, "needles": f"needle {ENERGY}", "device": "cpu"}
-  palpate.add_organ(spec, surface, "lower", pos=(0, 0, -0.0025), **more)
-  model, data, organ = load(spec)
-  drive(model, data, organ, [2.0])
+@pytest.mark.parametrize("free", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_both_layers_of_a_wall_are_pierced_by_their_own_toughness(free):
+  """Down through both and up again: each has a peak of its own on either way, one after the other.
+
+  So it takes G b over the thickness of each, and both have a hole where it went in and out.
+  """
+  model, data, organ = load(wall(free=free))
   lower = palpate.Organ(model, data, "lower")
-  assert len(organ.pinholes) == len(lower.pinholes) == 1
-  assert organ.pinholes[0].along < lower.pinholes[0].along
+  layers, seen, energy, holes = (organ, lower), [], [], []
+  for angle in np.arange(0.0, 3.4, 2e-3):
+    data.ctrl[0] = angle
+    mujoco.mj_step(model, data)
+    along = data.site("needle_tip").xmat.reshape(3, 3)[:, 2]
+    seen.append([each.needles[0].tip_force @ along for each in layers])
+    energy.append([each.needles[0].energy for each in layers])
+    holes.append([len(each.pinholes) for each in layers])
+  made = [np.argmax(np.array(holes)[:, k] > n) for k, n in ((0, 0), (1, 0), (1, 1), (0, 1))]
+  assert (np.diff(made) > 0).all()
+  assert made[0] > 0
+  force, takes = np.array(seen), np.diff(energy, axis=0, append=np.nan) > 0
+  for k, (toughness, thickness) in enumerate(((ENERGY, THICK), (300, LOWER["thickness"]))):
+    bears = toughness * SLIT
+    assert np.median(force[takes[:, k], k]) == pytest.approx(bears, rel=5e-3)
+    assert force[:, k].max() == pytest.approx(bears, rel=0.1)
+    assert energy[-1][k] == pytest.approx(2 * bears * thickness, rel=5e-3)
+    assert layers[k].error is None
 
 
 def test_a_needle_that_is_levered_sideways_tears_the_sheet():

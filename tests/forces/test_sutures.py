@@ -8,6 +8,7 @@ from scenes import state
 from scenes.needles import (
   ENERGY,
   LENGTH,
+  LOWER,
   RADIUS,
   SHEET,
   STEP,
@@ -17,6 +18,7 @@ from scenes.needles import (
   pull,
   scene,
   sheet,
+  wall,
 )
 
 
@@ -57,6 +59,43 @@ def test_a_thread_slides_through_a_hole_as_around_a_capstan():
   aside = np.array([0.0, 0.8, 0.6])
   (hole,) = tears_at(model, data, organ, {0: aside, nodes - 1: aside * (1, 1, -1)}, 1.2)
   assert np.linalg.norm(hole.force) == pytest.approx(ENERGY * THICK, rel=0.03)
+
+
+def test_a_thread_goes_through_both_layers_of_a_wall_and_tears_the_weaker_one():
+  """It follows the needle down and up, four holes in all; layers in touch do not pinch it.
+
+  Each bears G by its own thickness. Pulled aside at both ends, the lower one tears.
+  """
+  model, data, organ = load(wall(nodes=28, free=True))
+  thread, lower = palpate.Thread(model, data, "suture"), palpate.Organ(model, data, "lower")
+  start, taut = data.ctrl[0], 0.0
+  for k in range(1050):
+    data.ctrl[0] = start + 6.1 * (k + 1) / 1050
+    mujoco.mj_step(model, data)
+    taut = max(taut, thread.tension.max())
+  holes = [hole for pair in zip(organ.pinholes, lower.pinholes, strict=True) for hole in pair]
+  assert all(hole.thread for hole in holes)
+  first, down, out, up = (holes[k].along for k in (0, 1, 3, 2))
+  assert first < down < out < up < 0
+  assert taut < 0.5
+  for each in (organ, lower, thread):
+    assert each.error is None
+  nodes, pos = 24, (0.017, 0, 0)
+  model, data, organ = load(wall(nodes=nodes, pos=pos, foundation=3e7))
+  lower = palpate.Organ(model, data, "lower")
+  model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # the holes alone
+  drive(model, data, organ, [5.0])
+  assert organ.pinholes[0].thread and lower.pinholes[0].thread
+  data.eq_active[:] = 0
+  aside = np.array([0.0, 1.0, 0.0])
+  ends = {0: aside, nodes - 1: aside}
+  for _ in pull(model, data, ends, 0.001, 0.3, 300):
+    pass
+  (hole,) = tears_at(model, data, lower, ends, 1.1, start=0.3)
+  bears = 300 * LOWER["thickness"]
+  assert np.linalg.norm(hole.force) == pytest.approx(bears, rel=0.03)
+  assert organ.pinholes[0].torn == 0
+  assert 0.5 * bears < np.linalg.norm(organ.pinholes[0].force) < ENERGY * THICK
 
 
 @pytest.mark.parametrize(("along", "across", "back"), [(1.6e-3, 2e-3, True), (3e-4, 1e-3, False)])
@@ -258,10 +297,10 @@ def test_what_cannot_be_sewn_is_told():
     thread.lay([(0, 0, 0), (1, 0, 0)])
 
 
-def tears_at(model, data, organ, ends, most):
+def tears_at(model, data, organ, ends, most, start=0.0):
   """Pulls at nodes by rising forces [N]; returns pinholes as they were before the first tore."""
   before = organ.pinholes
-  for _ in pull(model, data, ends, 0.0, most, 500):
+  for _ in pull(model, data, ends, start, most, 500):
     if organ.pinholes[0].torn > before[0].torn + 1e-5:
       return before
     before = organ.pinholes

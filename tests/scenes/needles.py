@@ -11,6 +11,7 @@ RADIUS = LENGTH / np.pi
 THICK = 1.5e-3  # of the sheet [m]
 ENERGY, FRICTION = 800.0, 40.0  # [J/m^2], [N/m]
 SHEET = {"mass": 0.003, "young": 4e5, "thickness": THICK}
+LOWER = {"thickness": 2.5e-3, "needles": "needle 300 10"}  # of a wall's lower layer
 SOLID = {"young": 1e4, "poisson": 0.45, "elements": "solid"}
 SOFT = "needle 150 5 300"  # of the solid; its surface bears twice as much
 
@@ -89,6 +90,16 @@ def scene(
   needles = needles or (SOFT if solid else f"needle {ENERGY} {FRICTION}")
   given = kind | {"pin": pin, "device": "cpu"} | config
   palpate.add_organ(spec, mesh or surface, needles=needles, windows=windows, **given)
+  return spec
+
+
+def wall(gap=0.002, **given):
+  """Returns a scene with a wall of two layers: under the sheet, in touch with it, lies `lower`."""
+  spec = scene(**given)
+  mesh, pin = (given["mesh"], given["pin"]) if "mesh" in given else sheet()
+  pos = (*given.get("pos", (0, 0))[:2], -gap)
+  more = SHEET | LOWER | {"contact": given.get("contact", {})}
+  palpate.add_organ(spec, mesh, "lower", pin=pin, pos=pos, device="cpu", **more)
   return spec
 
 

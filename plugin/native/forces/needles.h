@@ -61,7 +61,7 @@ PALPATE Fields of_world(Fields f, int world) {
 template <class Fields>
 PALPATE Fields held_in_world(Fields f, int world) {
   f.pierced = of_world(f.pierced, world);
-  move_each(world, f.first, f.tie_count, f.tie_edge, f.tie_value);
+  move_each(world, f.first, f.tie_count, f.tie_edge, f.tie_value, f.span);
   return f;
 }
 
@@ -233,6 +233,24 @@ PALPATE double borne(const Fields& f, const double* law, const double* s) {
   return s[NEEDLE_STAGE] == TOUCHING && f.ntet ? law[PIERCE_SURFACE] : law[PIERCE_FORCE];
 }
 
+// Moves the newest hole of a sheet to where the needle goes through it, if it would be pulled off the sheet where its tip
+// first touched: while a thick wall gives way the tip turns aside.
+template <class Fields>
+PALPATE void meet_needle(const Fields& f, Thread t, int i, const Arc& arc, D3 normal, double* s) {
+  const int n = (int)s[NEEDLE_COUNT] - 1;
+  const D3 p = seat_of_hole(f, s, n).at;
+  const double place = arc.nearest(p), reach = POINT * arc.length;
+  const double clear = n ? place - place_of_hole(f, arc, s, n - 1) - CLEAR * arc.length : reach;
+  const double back = clear < reach ? clear : reach;
+  const D3 along = arc.along(place), at = arc.place(place), off = at - p;
+  const double far = norm(off), bears = bears_across(f, i, arc, s, n) / f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
+  int elem = 0;
+  D3 w;
+  if (far > bears && fabs(dot(off, normal)) > MISSES * far &&
+      find_triangle(f, t, {at - back * along, along, back + reach}, 0, elem, w))
+    put_seat(hole(s, n) + HOLE_ELEM, elem, {w.y, w.z, 0.0});
+}
+
 // A tip at a surface: it goes, or pierces it.
 template <class Fields>
 PALPATE void press(const Fields& f, Thread t, int i, const Arc& arc, double* s) {
@@ -258,6 +276,7 @@ PALPATE void press(const Fields& f, Thread t, int i, const Arc& arc, double* s) 
   }
   const double place = arc.nearest(seat.at);
   make_hole(s, !f.ntet ? THROUGH : leaves ? OUT : INTO, place);
+  if (!f.ntet) meet_needle(f, t, i, arc, unit_of(cross(x[1] - x[0], x[2] - x[0])), s);
   s[NEEDLE_STAGE] = AWAY;
   if (f.ntet && !leaves && !sit_inside(f, t, seat.at + (BELOW * f.edge) * along, s)) {
     s[NEEDLE_COUNT] -= 1.0;  // along a face: later
@@ -535,10 +554,9 @@ PALPATE void tie_needle(const Fields& f, Thread t, int i, const Arc& arc, const 
   if (ties || count) f.solve.quiet.data[0] = 0.0;
 }
 
-// Says which of a needle's geoms do not touch the organ: those from a little before its first hole on, or its point;
-// and which edges of its thread.
+// Says which of a needle's geoms do not touch the organ: those from a little before its first hole on, or its point.
 template <class Fields>
-PALPATE void lift_contacts(const Fields& f, int i, const Arc& arc, double* s) {
+PALPATE void lift_geoms(const Fields& f, int i, const Arc& arc, double* s) {
   double low = arc.length;
   for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
     const double place = place_of_hole(f, arc, s, n);
@@ -547,20 +565,27 @@ PALPATE void lift_contacts(const Fields& f, int i, const Arc& arc, double* s) {
   low -= f.law.data[PIERCE_LENGTH * i + PIERCE_MARGIN];
   for (int g = 0; g < f.nlisted; ++g)
     if (f.whose.data[g] == i) f.lifted.data[f.geom.data[g]] = f.end.data[g] > low;
+}
+
+// Where the organ says which edges of a needle's thread do not touch it: the first one, and that after the last.
+template <class Fields>
+PALPATE int* lifted_edges(const Fields& f, int i) {
+  return f.lifted.data + f.ngeom + 2 * f.strand_flex.data[i];
+}
+
+// Says which these are, once all organs have told where they hold it: those between its first hole and its last one,
+// whichever organ has these. Between layers that lie on each other both would press on it.
+template <class Fields>
+PALPATE void lift_thread(const Fields& given, Thread t, int i) {
+  const Fields all = held_in_world(given, t.world);
+  const auto& f = all.pierced;
+  int* edges = lifted_edges(f, i);
+  if (t.tid > 0 || !edges[1]) return;
   const auto thread = strand_of(f, i);
-  if (!thread.count) return;
-  double near = thread.length(), far = -1.0, part;
-  for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
-    const double place = hole(s, n)[HOLE_THREAD];  // 0 on the needle: its end may touch
-    near = place < near ? place : near;
-    far = place > far ? place : far;
-  }
-  const double margin = f.law.data[PIERCE_LENGTH * i + PIERCE_CLOSE];
-  int* edges = f.lifted.data + f.ngeom + 2 * f.strand_flex.data[i];
-  edges[0] = edges[1] = 0;
-  if (far < 0.0) return;
-  edges[0] = near > margin ? thread.find(near - margin, part) : 0;
-  edges[1] = thread.find(far + margin, part) + 1;
+  const double margin = f.law.data[PIERCE_LENGTH * i + PIERCE_CLOSE], near = all.span.data[0] - margin;
+  double part;
+  edges[0] = near > 0.0 ? thread.find(near, part) : 0;
+  edges[1] = thread.find(all.span.data[1] + margin, part) + 1;
 }
 
 // Says what holds a needle's thread, as the step begins: the points of the tissue where they will be.
@@ -573,9 +598,16 @@ PALPATE void aim_thread(const Fields& given, Thread t, int i) {
   const Arc arc = arc_of(f, i);
   close_holes(f, t, i, arc, s);
   if (t.tid > 0) return;
-  lift_contacts(f, i, arc, s);
+  lift_geoms(f, i, arc, s);
+  int* edges = lifted_edges(f, i);
+  edges[0] = 0;
+  edges[1] = s[NEEDLE_COUNT] > 0.0;
   all.first.data[0] = all.tie_count.data[0];
   for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
+    const double place = hole(s, n)[HOLE_THREAD];  // 0 on the needle: its end may touch
+    double* span = all.span.data;
+    span[0] = place < span[0] ? place : span[0];
+    span[1] = place > span[1] ? place : span[1];
     const int at = all.tie_count.data[0];
     if (!on_thread(s, n) || at == MOST_TIES) continue;
     double* tie = all.tie_value.data + TIE_LENGTH * at;
@@ -637,7 +669,7 @@ PALPATE void enter_needles(const Fields& given, Thread t, int) {
     tie_needle(f, t, i, arc, moving, s);
     tear_by_thread(f, t, i, arc, s);
     if (t.tid > 0) continue;
-    lift_contacts(f, i, arc, s);
+    lift_geoms(f, i, arc, s);
     for (int c = 0; c < NEEDLE_LENGTH; ++c) f.next.data[NEEDLE_LENGTH * i + c] = s[c];
   }
 }
