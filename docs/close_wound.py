@@ -69,9 +69,7 @@ class Surgery:
     at, top, end = (
       data.site(f"{ORGAN}_{place}").xpos for place in ("body", "fundus", "infundibulum")
     )
-    whole = np.isfinite(self.organ.xpos).all(axis=1)
-    surface = trimesh.Trimesh(np.where(whole[:, None], self.organ.xpos, 1.0), self.organ.elem,
-                              process=False)  # fmt: skip
+    surface = self._surface(self.organ.xpos)
     (self.middle,), _, (near,) = trimesh.proximity.closest_point_naive(surface, at[None])
     out = surface.face_normals[near]
     along = top - end - (top - end) @ out * out
@@ -80,6 +78,10 @@ class Surgery:
     line = self.middle + np.linspace(-HALF, HALF, 20)[:, None] * along
     self.organ.cut(trimesh.proximity.closest_point_naive(surface, line)[0])
     self._look()
+
+  def _surface(self, x: np.ndarray) -> trimesh.Trimesh:
+    """Returns the surface with vertices at places (nvert, 3) [m]; spare ones have none."""
+    return trimesh.Trimesh(np.where(np.isfinite(x), x, 1.0), self.organ.elem, process=False)
 
   def _look(self):
     """Finds both lips, where stay sutures pull, and the marks of the stitches."""
@@ -95,7 +97,7 @@ class Surgery:
     self.stays = [np.flatnonzero(near & far & (s * place[:, 1] > 0)) for s in (-1, 1)]
     rows = PITCH * (np.arange(STITCHES) - (STITCHES - 1) / 2)
     marks = np.array([(row, s * BITE, 0.0) for row in rows for s in (1, -1)]) @ self.frame.T
-    surface = trimesh.Trimesh(np.where(np.isfinite(rest), rest, 1.0), elem, process=False)
+    surface = self._surface(rest)
     at, _, self.seat = trimesh.proximity.closest_point_naive(surface, self.middle + marks)
     self.share = trimesh.triangles.points_to_barycentric(surface.triangles[self.seat], at)
 
@@ -159,7 +161,7 @@ class Surgery:
     self.data.joint("hand").qpos[:] = np.concatenate([pos, quat])
     mujoco.mj_forward(self.model, self.data)
     swage = self.data.site("needle_swage").xpos
-    self.thread.lay([swage, swage + self.frame @ (0, 0.25, 0.5)])
+    self.thread.lay(np.array([swage, swage + self.frame @ (0, 0.25, 0.5)]))
 
   def drive(self, stitch: int):
     """Drives the needle down through one lip, up through the other one, and out."""

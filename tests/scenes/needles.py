@@ -1,5 +1,7 @@
 """A hand that turns a needle about the middle of its circle, into a sheet or a solid below."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import palpate
@@ -11,7 +13,7 @@ RADIUS = LENGTH / np.pi
 THICK = 1.5e-3  # of the sheet [m]
 ENERGY, FRICTION = 800.0, 40.0  # [J/m^2], [N/m]
 SHEET = {"mass": 0.003, "young": 4e5, "thickness": THICK}
-LOWER = {"thickness": 2.5e-3, "needles": "needle 300 10"}  # of a wall's lower layer
+LOWER: dict[str, Any] = {"thickness": 2.5e-3, "needles": "needle 300 10"}  # of a wall's lower layer
 SOLID = {"young": 1e4, "poisson": 0.45, "elements": "solid"}
 SOFT = "needle 150 5 300"  # of the solid; its surface bears twice as much
 
@@ -98,7 +100,7 @@ def wall(gap=0.002, **given):
   spec = scene(**given)
   mesh, pin = (given["mesh"], given["pin"]) if "mesh" in given else sheet()
   pos = (*given.get("pos", (0, 0))[:2], -gap)
-  more = SHEET | LOWER | {"contact": given.get("contact", {})}
+  more: dict[str, Any] = SHEET | LOWER | {"contact": given.get("contact", {})}
   palpate.add_organ(spec, mesh, "lower", pin=pin, pos=pos, device="cpu", **more)
   return spec
 
