@@ -476,10 +476,14 @@ class Running(Stitching):
 
   def _draw(self, p: Performer) -> Script:
     """Turns the needle out of the wall, and draws the thread after it."""
-    done, end = self.done, half_angle(self._ends(p)) + math.radians(185.0)
-    while self.done == done and self._angle(p) < end - 0.05:
+    end = half_angle(self._ends(p)) + math.radians(185.0)
+
+    def inside() -> bool:
+      return self.holes == 2 * self.done + 2
+
+    while inside() and self._angle(p) < end - 0.05:
       yield from self._turn(p, end)
-    while self.done == done:
+    while inside():  # not of a hole that is lost
       yield from p.line(p.tip + np.array([0.001, 0.0, 0.002]), 0.02)
     yield from self._pull(p, lambda: self.tight > _TAUT)
 
