@@ -41,7 +41,7 @@ from . import drain
 from .drain import MIDDLE
 
 FIELD = Scene(
-  instrument="knot_pusher", port=(0.0, 0.045, 0.11), camera=(0.042, -0.03, 0.045), nodes=400,
+  instrument="knot_pusher", port=(0.0, 0.045, 0.11), camera=(0.029, -0.021, 0.033), nodes=400,
 )  # fmt: skip
 CLOSED = 0.001  # gap of a slit that is [m], as FLS asks for
 EDGE = 4.5e-4  # of the thread, four of its radii [m]
