@@ -15,12 +15,12 @@ import palpate.tasks  # noqa: F401 - registers the exercises
 import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 
-GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.99, 0.95, 0.2, 5, 4
+GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.95, 0.95, 0.2, 5, 4  # see docs/training.md
 KL, ENTROPY, NOISE = 0.02, 0.001, 0.4  # change of the policy aimed at, in a minibatch
 STEPS, SCALE = 8, 10.0  # decisions of an iteration; of rewards, which add up to that
 FINE, LEFT = 0.005, 0.05  # the last of the way [m] and of the progress have scales of their own
 REPEAT, PACE = 2, 0.4  # control steps of a decision, and share of the rates that it uses
-CLOSE, OPEN = 0.075, 0.225  # what jaws close and open in a step at full rate: gentle forces [rad]
+JAWS, GENTLE = 0.1, 0.03  # how far the jaws' target moves at full rate, and is below them [rad]
 CLOSED, WIDE = -0.2, 1.0472  # where jaws are told to go by -1 and 1 [rad]
 PATIENCE, GAIN = 100, 0.05  # an episode ends after so many decisions, at most, that gain no more
 ENOUGH = 0.9  # success without noise that ends the training
@@ -60,8 +60,8 @@ def step(env, seen: dict, action: torch.Tensor) -> tuple[dict, torch.Tensor, tor
   total, won = torch.zeros_like(action[:, 0]), torch.full_like(action[:, 0], torch.nan)
   for _ in range(REPEAT):
     told = PACE * action.clamp(-1, 1)
-    if "gripper" in seen:
-      goal = seen["gripper"][:, :1] + told[:, 4:] * torch.where(told[:, 4:] > 0, OPEN, CLOSE)
+    if (jaws := seen.get("gripper")) is not None:
+      goal = torch.maximum(jaws[:, 1:2] + JAWS * told[:, 4:], jaws[:, :1] - GENTLE)
       told[:, 4:] = (2 * (goal - CLOSED) / (WIDE - CLOSED) - 1).clamp(-1, 1)
     seen, paid, _, _, info = env.step(told)
     total += SCALE * paid.float() * won.isnan()

@@ -20,10 +20,11 @@ before it is lowered start the holding again. Failure: a force above the damage 
 included, or the time limit.
 
 Shaping: until it is grasped 0.24 * `ready`, for jaws that are open near the site, are over the fold
-and close on it; then 0.26 - (0.14 + 0.12 * held) * min(height / lift, 1), less 0.15 * d / (1 + d)
+and close on it; then 0.26 - (0.14 + 0.15 * held) * min(height / lift, 1), less 0.15 * d / (1 + d)
 where the fold is pushed down by d lifts. So no grasp is paid less than what led to it, down to d of
-4, and most of what follows for the lift. Once held long enough it is 0, and 0.015 * (1 - 2 * pinch
-/ force limit), not below 0, while the fold rests low: jaws that loosen are about to let go.
+4, and most of what follows for the lift. Once held long enough it is -0.03, and more by 0.045 * (1
+- 2 * pinch / force limit), not below 0, while the fold rests low: jaws that loosen are about to let
+go.
 """
 
 import dataclasses
@@ -74,7 +75,8 @@ REST = 0.2  # at a low height before release [s]
 # Heights that it rests between, and is let go below, as shares of the lift.
 LOW, RESTING, LETTING = -0.25, 0.4, 0.5
 READY = 0.24  # shaping of jaws that are closed on the site, less than that of any grasp [-]
-LOOSE = 0.015  # shaping of jaws that hold a fold at rest without force [-]
+TIGHT = -0.03  # shaping of a fold that was held long enough [-]
+LOOSE = 0.045  # what it gains at rest in jaws without force [-]
 
 
 @exercise("grasp/easy", 20, "easy")
@@ -283,12 +285,13 @@ def shaping(s, o):
   """Returns what tells the way to a grasp, up from any depth of the fold, and to let go of it."""
   if o.done:
     loose = clamp(1.0 - 2.0 * pinch(s) / o.force_limit, 0.0, 1.0)
-    return LOOSE * loose if o.lowered >= REST - SLACK else 0.0
+    return TIGHT + LOOSE * loose if o.lowered >= REST - SLACK else TIGHT
   if o.grasped == 0.0:
     return READY * ready(s, o)
   share = raised(s, o) / o.lift
   high, pushed = clamp(share, 0.0, 1.0), max(-share, 0.0)
-  return 0.26 - high * (0.14 + 0.12 * min(o.time / o.hold, 1.0)) - 0.15 * pushed / (1.0 + pushed)
+  lifted = high * (0.14 + (0.12 - TIGHT) * min(o.time / o.hold, 1.0))
+  return 0.26 - lifted - 0.15 * pushed / (1.0 + pushed)
 
 
 def observe(s, o):

@@ -164,7 +164,7 @@ def test_a_potential_shows_the_way_to_a_grasp():
       potential[name] = env.task.progress + env.task.shaping
       assert not timestep.last() and potential[name] < 1
     env.task.done, env.task.lowered = True, grasp.REST
-    loose.append(grasp.shaping(env.physics, env.task))
+    loose.append(grasp.shaping(env.physics, env.task) - grasp.TIGHT)
 
   go(-0.68, ("beside, closed", 0.01, -0.68), ("pressed, closed", -0.006, -0.68))
   go(1.0, ("beside", 0.01, 1.0), ("over it", -0.006, 1.0), ("closing", -0.006, -0.2),
