@@ -297,6 +297,10 @@ class Worlds(Batch):
 
   def record(self):
     """Records the graphs, on a device that has them."""
+    with wp.ScopedDevice(self.device):  # where mujoco_warp makes its arrays
+      self._record()
+
+  def _record(self):
     work = {"step": self._once, "after": self._after}
     work |= {"reset": self._rest.launch, "look": self._rest.look}
     if not self.device.is_cuda:

@@ -21,6 +21,8 @@ def test_worlds_on_two_devices_are_those_on_one(first, second):
     made = mujoco.MjSpec.from_string(probed())
     batch = palpate.batch.make(made, 5, device=device, deterministic=True)
     tissue = batch.organ("organ")
+    for part in getattr(batch, "parts", [batch]):
+      part.watch(10)  # records the step anew
     tissue.configure(young_scale=[1.0, 1.5, 2.0, 0.5, 1.0], friction=1.0)
     batch.configure(gravity=[0.0, 0.0, -1.0])
     for k in range(30):
