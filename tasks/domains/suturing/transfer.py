@@ -372,7 +372,7 @@ class Transfer(Needlework):
     """Takes the needle from above, near the end that went first."""
     sign = -1.0 if back(self) else 1.0
     pos, mat = needle(p.physics)
-    goal, turn = grasp(p.trocar, pos, mat, sign * _TAKES, p.turn)
+    goal, turn = grasp(p.trocar, pos, mat, sign * _TAKES)
     up = mat[:, 2]
     closes = _over(p, (p.tip, p.turn), (goal, turn), up) and (p.tip - goal) @ up < _CLOSES
     p.extra[:] = p.share() if closes else WIDE
