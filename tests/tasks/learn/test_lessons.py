@@ -70,6 +70,16 @@ def test_a_teacher_of_the_transfer_goes_on_where_another_has_come_to():
       timestep = env.step(act(timestep))
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_teacher_of_the_transfer_takes_the_needle_back_from_the_same_side(seed):
+  kwargs = {"random": seed, "surroundings": "none"}
+  env = tasks.load("needle", "transfer_standard", task_kwargs=kwargs)
+  teacher = lessons.Teacher(env)
+  played(env, teacher, lambda task: task.done and task.right_holds, most=900)
+  roll = env.physics.joints()[2]
+  assert 0.0 < roll < np.pi / 2  # not half a turn from there, which grips it as well
+
+
 def test_a_lesson_is_what_the_expert_meant_from_its_turn_on():
   env = tasks.load("touch", "easy", task_kwargs={"surroundings": "none"})
   names = ("target", "joints")
