@@ -23,6 +23,7 @@ SHAKEN, CALM = 25, 50  # control steps that noise lasts, and that follow without
 # What it shakes. Not the roll: where an expert does not turn the shaft, its clone shall not.
 SHAKES = tuple(name for name in AXES if name != "roll")
 _BACK = 0.2  # share of what has shaken the instrument that is made up in a control step
+_STILL = 1e-9  # change of a goal in a control step that is none [rad, m]
 EXPERT = (20, 80)  # control steps of an expert's turn, at least and at most
 PATIENCE = (40, 120)  # control steps without progress that end a policy's turn
 
@@ -56,6 +57,9 @@ class Teacher(Performer):
   A slow start is hard to tell from an end, a pause from having come to rest, and a single step is
   easily missed. It searches no longer than it must: what is done long after its cause is hard to
   learn.
+
+  Attributes:
+    moves: whether the script moves the hand now
   """
 
   hasty = True
@@ -63,7 +67,7 @@ class Teacher(Performer):
   def begin(self) -> None:
     """See `Performer`."""
     super().begin()
-    self._before = self.hand.drive_targets()
+    self._before, self.moves = self.hand.drive_targets(), False
 
   def drive(self, goal: np.ndarray) -> np.ndarray:
     """Returns where the drives go on the way to a goal: what has shaken them is made up slowly.
@@ -71,6 +75,7 @@ class Teacher(Performer):
     What is undone at once is neither seen nor learned.
     """
     before, self._before = self._before, goal
+    self.moves = not np.allclose(goal, before, rtol=0.0, atol=_STILL)
     return self.hand.drive_targets() + goal - before + _BACK * (before - self.hand.drive_targets())
 
   def shares(self, steps: int) -> Iterator[float]:
@@ -105,15 +110,16 @@ def give(
     names: of what is observed
     seed: of the episode
     gamma: discount of a control step [-]
-    noise: SD of what is added to the expert's motion now and then; what is kept is what it meant
-      to do (DART: Laskey et al. 2017, 10.48550/arXiv.1703.09327) [-]
+    noise: SD of what is added to the motion of a hand that the expert moves, now and then; what is
+      kept is what it meant to do (DART: Laskey et al. 2017, 10.48550/arXiv.1703.09327) [-]
     learner: takes turns with experts, and begins
     most: control steps of its turns at most; all, by default, as long as it gets on. With it an
       expert begins every other time: who fails at once would not be taught how to begin
   """
   task: Any = env.task
   task.random, random = np.random.RandomState(seed), np.random.RandomState(seed)
-  moves = noise * np.array([name.endswith(SHAKES) for name in task.components])
+  shaken = noise * np.array([name.endswith(SHAKES) for name in task.components])
+  own = np.arange(len(shaken)) < len(task.moved(task.prefix)) + len(task.extra)
   final = np.isin(task.components, task.final)
   timestep, phase = env.reset(), random.randint(SHAKEN + CALM)
   act = learner.begin() if learner else None
@@ -121,12 +127,14 @@ def give(
   seen, meant, done, taught, rewards, best = [], [], [], [], [], 0
   while not timestep.last():
     seen.append(flat(timestep.observation, names))
-    action = act(timestep.observation) if act else np.zeros(len(moves))  # it sees all
+    action = act(timestep.observation) if act else np.zeros(len(shaken))  # it sees all
     expert = turns.next(bool((action[final] > 0.5).any()))
-    meant.append(np.zeros(len(moves)) if expert is None else np.asarray(expert(timestep), float))
+    meant.append(np.zeros(len(shaken)) if expert is None else np.asarray(expert(timestep), float))
     if expert is not None:
       shakes = (len(done) + phase) % (SHAKEN + CALM) < SHAKEN
-      action = np.clip(meant[-1] + shakes * moves * random.normal(size=len(moves)), -1, 1)
+      moves = np.where(own, expert.moves, expert.other is not None and expert.other.moves)
+      off = shakes * moves * shaken * random.normal(size=len(shaken))
+      action = np.clip(meant[-1] + off, -1, 1)
     if act:
       act.last = action
     done.append(action)

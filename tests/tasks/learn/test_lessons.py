@@ -103,6 +103,15 @@ def test_a_lesson_is_what_the_expert_meant_from_its_turn_on():
   assert other.taught[: lessons.EXPERT[0]].all()  # there the expert begins
 
 
+def test_only_the_hand_that_the_expert_moves_is_shaken():
+  kwargs = {"surroundings": "none", "time_limit": 1.0}
+  env = tasks.load("needle", "transfer_easy", task_kwargs=kwargs)
+  lesson = lessons.give(env, ("target",), 3, 0.99, noise=0.3)
+  right, left = np.split(lesson.done - lesson.meant, 2, axis=1)
+  assert np.abs(right).max() > 0.3
+  np.testing.assert_allclose(left, 0.0, atol=1e-6)
+
+
 def test_who_does_not_get_on_is_helped_and_what_did_not_help_is_not_learned():
   env = tasks.load("touch", "easy", task_kwargs={"surroundings": "none"})
   idle = lessons.give(env, ("target",), 5, 0.5, learner=says([0, 0, 0, 0]))
