@@ -63,6 +63,7 @@ _SNUG = 0.0018  # of a strand in a throw that is drawn tight, at most, for each 
 _LET_GO = 0.3  # strands lie so long before the knot is tested [s]
 _HOLDS, _LAST, _RISES = PULL, 2.0, 2.0  # pull that it is to hold, the last [N], and the rise [N/s]
 _TRIES, _LIFT = 6, np.array([0.0, 0.0, 0.002])  # of the expert at a throw, and between them [m]
+_LAID = 0.004  # least depth below the ring of a throw that was just laid [m]
 _MARK = 0.018  # height of the mark over the drain [m]
 
 
@@ -296,7 +297,8 @@ class Extracorporeal(Task):
   def expert(self, p: Performer) -> Script:
     """Takes the ring down the post, presses each throw home, and goes back up."""
     while self.outcome is None:
-      yield from p.wait(0.2)
+      if p.tip[2] - self.throw[2] > _LAID:  # strands that were just laid draw straight: all wait
+        yield from Performer.wait(p, 0.2)
       laid = self.laid
       goal = np.array([0.0, 0.0, drain.HIGH + 0.001])
       yield from p.move(goal, speed=0.02)
