@@ -25,13 +25,13 @@ It has no vectorised form: a batch cannot lay a thread and sew it while it runs.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
 from palpate.models import trocar
 
-from ...core.base import Physics
+from ...core.base import Physics, Task
 from ...core.performer import Performer, Script
 from ...core.rules import closeness
 from ...core.scenes import CONTACT, Scene
@@ -39,11 +39,13 @@ from ...metrics import knots
 from ...registry import exercise
 from . import drain
 from .drain import MIDDLE
-from .tying import CLOSED, EDGE, PULL, STAYS, Tying
 
 FIELD = Scene(
   instrument="knot_pusher", port=(0.0, 0.045, 0.11), camera=(0.029, -0.021, 0.033), nodes=400,
 )  # fmt: skip
+CLOSED = 0.001  # gap of a slit that is [m], as FLS asks for
+EDGE = 4.5e-4  # of the thread, four of its radii [m]
+PULL = 0.6  # of each hand outside [N]
 HIGH = 0.010  # of a throw that is laid over what it is to be pushed to [m]
 _HANDS = np.array([0.0, -0.006, 0.026])  # from the stitch to between the hands outside [m]
 _APART = 0.008  # of these [m]
@@ -56,7 +58,10 @@ _TURNS = 121  # points that it is laid with
 _PAST = 6e-4  # from strands that cross over it to between them [m]
 _TOUCH = 1.5 * EDGE  # between nodes of strands that touch [m]
 _SEAT = 0.003  # a throw no higher over the holes is down [m]
+_STAYS = 0.3  # and is to stay there for so long [s]
 _SNUG = 0.0018  # of a strand in a throw that is drawn tight, at most, for each half turn [m]
+_LET_GO = 0.3  # strands lie so long before the knot is tested [s]
+_HOLDS, _LAST, _RISES = PULL, 2.0, 2.0  # pull that it is to hold, the last [N], and the rise [N/s]
 _TRIES, _LIFT = 6, np.array([0.0, 0.0, 0.002])  # of the expert at a throw, and between them [m]
 _LAID = 0.004  # least depth below the ring of a throw that was just laid [m]
 _MARK = 0.018  # height of the mark over the drain [m]
@@ -80,12 +85,24 @@ def hard(**kwargs):
   return Extracorporeal(FIELD, **{"turns": (2, 1, 1), **kwargs})
 
 
-class Extracorporeal(Tying):
+class Extracorporeal(Task):
   """Push throws down with a knot pusher."""
 
-  def __init__(self, scene: Scene, random=None, **kwargs):
-    """Makes the task, see `Tying`."""
-    super().__init__(scene, random, **{"force_limit": 3.0, "damage": 6.0, **kwargs})
+  settles = drain.SETTLES
+
+  def __init__(self, scene: Scene, random=None, *, turns: Sequence[int], **kwargs):
+    """Makes the task.
+
+    Args:
+      scene: what it plays in
+      random: see Task
+      turns: how often the strands wind about each other in each throw, (1, 1) of a square knot,
+        (2, 1, 1) of a surgeon's
+      **kwargs: see Task
+    """
+    self.turns, self.throws = tuple(turns), len(turns)
+    kwargs = {"force_limit": 3.0, "damage": 6.0, **kwargs}
+    super().__init__(scene, random, **kwargs)
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: the drain, its thread, and a slide for each of its ends."""
@@ -111,9 +128,12 @@ class Extracorporeal(Tying):
         geom.solref, geom.solimp[:3] = CONTACT["solref"], CONTACT["solimp"]
     return spec
 
+  def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Returns all of the drain, and the middle of the stitch."""
+    return np.arange(len(physics.organ.elem)), MIDDLE
+
   def begin(self, physics: Physics) -> None:
     """Lays the first throw, and puts the pusher's ring around the post above it."""
-    super().begin(physics)
     # The way round of the first throw. The pusher takes the post past the tail on the side of +y,
     # where it comes from: a left-handed second throw lies flat so, another one capsizes.
     self.hand = int(self.random.choice([-1, 1])) if self.throws == 1 else 1
@@ -126,8 +146,12 @@ class Extracorporeal(Tying):
       name: np.array([(places[node] - physics.model.ptr.body(name).pos) @ way])
       for name, node, way in _ends(len(places))
     }
-    self.laid, self.high0, self.slack = 1, HIGH, False
-    self.below = self.sunk = 0.0
+    self.laid, self.seated, self.stayed, self.free = 1, 0, 0.0, 0.0
+    self.high0 = HIGH
+    self.gap = self.left = drain.GAPE  # now, and before the knot was pulled at
+    self.tension = self.below = self.sunk = 0.0
+    self.slack = False
+    self.knot, self.pulled, self.held = "", 0.0, 0.0
     self.stitch, self.throw = MIDDLE, post[1:-1].mean(axis=0)
 
   def pull(self, physics: Physics, force: float) -> None:
@@ -136,12 +160,16 @@ class Extracorporeal(Tying):
       physics.data.ctrl[physics.model.ptr.actuator(name).id] = force
 
   def look(self, physics: Physics) -> None:
-    """Finds the throw too."""
-    super().look(physics)
+    """Finds the throw, the gap, the tension, and how far holes are torn."""
+    thread = physics.thread
+    assert thread
+    places = thread.positions
+    self.tension = float(thread.tension.max())
+    self.broken = bool(thread.broken.any())
+    holes = physics.organ.pinholes
+    self.whole = len(holes) == 2
     if not self.whole:
       return
-    assert physics.thread
-    places, holes = physics.thread.positions, physics.organ.pinholes
     self.stitch = np.mean([hole.at for hole in holes], axis=0)
     # It slides in its holes: what is outside of them now.
     first, second = sorted(int(-hole.along / EDGE) for hole in holes)
@@ -152,11 +180,14 @@ class Extracorporeal(Tying):
     rows = np.flatnonzero(near[: ring + 1].any(axis=1))  # no throw is beyond it
     self.throw = post[rows[-1]] if len(rows) else 0.5 * (post[0] + tail[0])
     self.below = EDGE * max(rows[-1], np.flatnonzero(near[rows[-1]])[0]) if len(rows) else 0.0
+    self.gap = drain.gap(physics.nodes(), self.scene.nodes)
 
   def advance(self, physics: Physics) -> float:
     """Follows the throw down; see the module's head."""
     self.look(physics)
-    if self.lost(physics):
+    if self.broken or not self.whole:
+      self.outcome = "damage"
+      self.event(physics, "note", label="thread broken" if self.broken else "torn out of the drain")
       return -1.0
     high = float(self.throw[2] - self.stitch[2])
     waits = self.laid == self.seated
@@ -164,13 +195,11 @@ class Extracorporeal(Tying):
     self.slack = high < _SEAT and self.below - self.sunk > snug
     down = high < _SEAT and self.gap < CLOSED and not self.slack
     self.stayed = self.stayed + self.control_timestep if down and not waits else 0.0
-    if self.stayed > STAYS - 1e-6:
+    if self.stayed > _STAYS - 1e-6:
       self.seated, self.stayed, self.sunk = self.seated + 1, 0.0, self.below
       self.event(physics, "target", self.gap, "throw")
       waits = True
     if self.seated == self.throws:
-      if self.throws > 1 and not self.free:
-        self.pull(physics, 0.0)
       return self.judge(physics)
     if waits:
       if physics.tip_pos()[2] > drain.HIGH + _MARK:
@@ -178,13 +207,34 @@ class Extracorporeal(Tying):
       return self.seated / self.throws
     return (self.seated + 0.9 * max(closeness(high, self.high0), 0.0)) / self.throws
 
-  def hands(self) -> tuple[int, ...]:
-    """Returns the hand of the first throw."""
-    return (self.hand,)
-
-  def loop(self, places: np.ndarray) -> np.ndarray:
-    """Returns the thread with its ends led away to both sides."""
-    return knots.closed(places, np.array([-1.0, 0.0, 0.0]))
+  def judge(self, physics: Physics) -> float:
+    """Lets the strands go and pulls the stitch apart: is the knot right, and does it hold?"""
+    if self.throws == 1:
+      self.outcome = "success"
+      return 1.0
+    if not self.free:
+      self.pull(physics, 0.0)
+    if not self.pulled:
+      self.left = self.gap
+    if self.gap < drain.GAPE:
+      self.held = self.pulled
+    gapes = self.left > CLOSED and self.free > _LET_GO - 1e-6
+    if gapes or self.gap > drain.GAPE or self.pulled == _LAST:
+      assert physics.thread
+      places = knots.closed(physics.thread.positions, np.array([-1.0, 0.0, 0.0]))
+      self.knot = knots.name(places)
+      wound = [-self.hand * (-1) ** k * turns for k, turns in enumerate(self.turns)]
+      right = sorted(knots.throws(places) or ()) == sorted(wound)
+      if right and self.held > _HOLDS - 1e-6:
+        self.outcome = "success"
+        return 1.0
+      self.outcome = "missed"
+      self.event(physics, "note", label="the knot did not hold" if right else "a wrong knot")
+      return 0.95
+    self.free += self.control_timestep
+    self.pulled = float(np.clip(_RISES * (self.free - _LET_GO), 0.0, _LAST))
+    drain.part(physics.organ, self.scene.nodes, self.pulled)
+    return 0.95
 
   def tie(self, physics: Physics) -> None:
     """Lays the next throw over the last one, the other way round, as the hands outside tie it."""
@@ -228,6 +278,13 @@ class Extracorporeal(Tying):
     """Marks where the pusher is to go back to."""
     waits = self.laid == self.seated < self.throws
     physics.mark(0, self.mark, waits, waits, 0.001)
+
+  def recorded(self, physics: Physics) -> dict[str, float]:
+    """Returns gap, tension and the pull on the drain."""
+    pull = float(np.linalg.norm(physics.organ.needles[0].force))
+    gap = self.left if self.pulled else self.gap
+    found = {"traction": pull, "gap": gap, "tension": self.tension}
+    return found | ({"security": self.held} if self.throws > 1 else {})
 
   def instruct(self, physics: Physics) -> str:
     """Says what is next."""
