@@ -41,7 +41,7 @@ def test_a_soft_cube_swings_out_after_its_fall(scenes):
   model = scenes.resting("edge", 2e-3, young=3e3)[0].compile()
   data = mujoco.MjData(model)
   organ, energy, force = palpate.Organ(model, data, "organ"), [], []
-  for _ in range(1500):
+  for _ in range(2000):
     mujoco.mj_step(model, data)
     at = np.concatenate([organ.xpos, organ.inside])
     speed = (organ.xvel**2).sum(axis=1).mean()
