@@ -333,33 +333,20 @@ PALPATE Sym across_and_along(double a, double b, D3 n) {
   return {a + c * n.x * n.x, c * n.x * n.y, c * n.x * n.z, a + c * n.y * n.y, c * n.y * n.z, a + c * n.z * n.z};
 }
 
-PALPATE int within(int a, int low, int high) { return a < low ? low : a > high ? high : a; }
-
-// Where the next hole towards the needle, or with -1 the one before, is on the thread; 0 if on none.
-PALPATE double next_on_thread(double* s, int n, int way) {
-  const int other = n + way;
-  return other >= 0 && other < (int)s[NEEDLE_COUNT] ? hole(s, other)[HOLE_THREAD] : 0.0;
-}
-
 // A hole's thread: the edge that is in it, the share of that, and how it is there. It turns by `angle` between edges
-// beside that, far enough for a thread that resists bending but not past the next hole, where it may turn back; the needle
-// itself is what is before the first one. It slides along the mean of both, so that equal tensions do not make it slide
-// wherever on the edge it is.
+// beside that, far enough for a thread that resists bending; the needle itself is what is before the first one. It slides along the mean of both, so that equal
+// tensions do not make it slide wherever on the edge it is.
 struct Passing { int edge; double part, angle; D3 at, along; };
 
 template <class Fields>
-CALLED Passing passing(const Fields& f, int i, const Arc& arc, double* s, int n) {
+CALLED Passing passing(const Fields& f, int i, const Arc& arc, double place) {
   const auto thread = strand_of(f, i);
   Passing out;
-  const int e = out.edge = thread.find(hole(s, n)[HOLE_THREAD], out.part);
+  const int e = out.edge = thread.find(place, out.part);
   const D3 from = thread.at(e), to = thread.at(e + 1), zero = {0.0, 0.0, 0.0};
   out.at = (1.0 - out.part) * from + out.part * to;
-  int first = e > BESIDE ? e - BESIDE : 0, last = e + BESIDE + 2 < thread.count ? e + BESIDE : thread.count - 2;
-  const double next = next_on_thread(s, n, 1), previous = next_on_thread(s, n, -1);
-  double part;
-  if (next > 0.0) first = within(thread.find(next, part) + 1, first, e);
-  if (previous > 0.0) last = within(thread.find(previous, part) - 1, e, last);
-  const D3 before = e || next > 0.0 ? unit_of(thread.at(first + 1) - thread.at(first)) : zero - arc.along(0.0);
+  const int first = e > BESIDE ? e - BESIDE : 0, last = e + BESIDE + 2 < thread.count ? e + BESIDE : thread.count - 2;
+  const D3 before = e ? unit_of(thread.at(first + 1) - thread.at(first)) : zero - arc.along(0.0);
   const D3 after = unit_of(thread.at(last + 1) - thread.at(last));
   const D3 both = before + after;
   out.angle = atan2(norm(cross(before, after)), dot(before, after));
@@ -469,7 +456,7 @@ template <class Fields>
 PALPATE void follow_thread(const Fields& f, int i, const Arc& arc, double* s, int n) {
   const auto thread = strand_of(f, i);
   double& place = hole(s, n)[HOLE_THREAD];
-  const Passing by = passing(f, i, arc, s, n);
+  const Passing by = passing(f, i, arc, place);
   const Seat seat = seat_of_hole(f, s, n);
   const D3 p = seat.at;
   const double off = dot(by.at - p, by.along);
@@ -489,7 +476,7 @@ PALPATE void follow_thread(const Fields& f, int i, const Arc& arc, double* s, in
 template <class Fields>
 PALPATE void tie_thread(const Fields& f, Thread t, int i, int n, const Arc& arc, double weight, double* s) {
   const Seat seat = seat_of_hole(f, s, n);
-  const Passing by = passing(f, i, arc, s, n);
+  const Passing by = passing(f, i, arc, hole(s, n)[HOLE_THREAD]);
   const double most = thread_friction(f, i, arc, by, seat, s, n);
   const bool sticks = f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS] * fabs(dot(by.at - seat.at, by.along)) < most;
   const D3 force = load(f.pull.data + 3 * (POINTS * i + n));
@@ -625,7 +612,7 @@ PALPATE void aim_thread(const Fields& given, Thread t, int i) {
     if (!on_thread(s, n) || at == MOST_TIES) continue;
     double* tie = all.tie_value.data + TIE_LENGTH * at;
     const Seat seat = seat_of_hole(f, s, n);
-    const Passing by = passing(f, i, arc, s, n);
+    const Passing by = passing(f, i, arc, hole(s, n)[HOLE_THREAD]);
     D3 vel = {0.0, 0.0, 0.0};
     for (int c = 0; c < seat.count; ++c) vel += seat.share[c] * goes_by(f.mj, f.own, seat.vert[c]);
     const D3 goes = in_world(f.own.frame.data, f.own.origin.data, seat.at + f.mj.timestep.data[0] * vel);
