@@ -14,10 +14,10 @@ from palpate.tasks.people import score
 
 HERE = pathlib.Path(__file__).parent
 # Share of experts that are not proficient where it is above 5 %: rare peaks of pressure and strain,
-# and gaps of running sutures whose references are older. And of those that fail: a thread that is
+# and gaps of a running suture whose references are older. And of those that fail: a thread that is
 # torn out where two of its holes meet.
-SHORT = {"bimanual/hard": 0.12, "suture/running_easy": 0.06, "suture/running_standard": 0.09,
-         "suture/running_hard": 0.1, "suture/extracorporeal_standard": 0.14}  # fmt: skip
+SHORT = {"bimanual/hard": 0.12, "suture/running_easy": 0.06, "suture/running_hard": 0.1,
+         "suture/extracorporeal_standard": 0.14}  # fmt: skip
 FAIL = {"suture/extracorporeal_standard": 0.07}
 
 
