@@ -47,7 +47,7 @@ for _each in (
 
 @contextlib.contextmanager
 def instead(changes: list[tuple[Any, str, Any]]) -> Iterator[None]:
-  """Lets attributes of mujoco_warp's, (owner, name, value), be others within."""
+  """Gives attributes of modules other values within: (owner, name, value)."""
   kept = [(owner, name, getattr(owner, name)) for owner, name, _ in changes]
   try:
     for change in changes:

@@ -22,7 +22,7 @@ from palpate import tasks
 
 SCRIPT = pathlib.Path(__file__).parents[3] / "docs" / "tutorials" / "ppo.py"
 NAMES = tuple(f"{domain}/easy" for domain in ("touch", "probe", "trace", "grasp", "retract"))
-DISCOUNT = {"grasp/easy": 0.95}  # where it is not the script's 0.99, see docs/training.md
+DISCOUNT = {"grasp/easy": 0.95}  # where it is not the script's own, see docs/training.md
 ENOUGH = 90.0  # success that is asked for [%]
 POINTS = 30  # rows that are kept of a curve, and the last
 
@@ -45,7 +45,7 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   cases = [
     {"case": f"{task}-{seed}", "task": task, "seed": seed}
     | keys
-    | {"discount": DISCOUNT.get(task, 0.99)}
+    | ({"discount": DISCOUNT[task]} if task in DISCOUNT else {})
     for seed in args.seeds
     for task in args.tasks
   ]
@@ -55,7 +55,8 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
 def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Trains, and returns rows of the curve."""
   options = {"minutes": "most"} | {key: key for key in ("device", "worlds", "seed", "discount")}
-  words = [word for name, key in options.items() for word in (f"--{name}", str(case[key]))]
+  told = {name: case[key] for name, key in options.items() if key in case}
+  words = [word for name, value in told.items() for word in (f"--{name}", str(value))]
   command = [sys.executable, str(SCRIPT), case["task"], *words]
   with tempfile.TemporaryFile("w+", encoding="utf-8") as curve:
     ended = subprocess.run(command, stdout=curve, stderr=subprocess.PIPE, text=True)
