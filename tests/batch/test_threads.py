@@ -129,6 +129,19 @@ def test_a_held_thread_does_not_meet_the_jaws_that_it_is_in(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_a_body_on_a_thread_rests_on_a_table_as_under_the_plugin(device):
+  world = """<geom type="plane" size="1 1 1" pos="0 0 -0.0101"/><body name="box"><freejoint/>
+    <geom type="box" size="0.004 0.004 0.01" mass="0.01"/></body>"""
+  after = '<equality><connect body1="box" body2="t_0" anchor="0 0 0"/></equality>'
+  line, unmet = one.line(11, 0.02), 'contype="0" conaffinity="0"'
+  text = one.document(line, pin=(10,), world=world, after=after, contact=unmet)
+  model, data, _, worlds = scene(text, device)
+  run(model, data, worlds, 100)
+  assert data.body("box").xpos[2] == pytest.approx(-1e-4, abs=2e-4)
+  np.testing.assert_allclose(worlds.qpos.numpy()[1], data.qpos, atol=1e-5)
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_a_world_goes_on_where_a_state_says(device):
   """There and back, and after a reset."""
   model, data, thread, worlds = scene(one.needle(1e-3), device)

@@ -197,7 +197,7 @@ def press(p: Pressed):
 
 @theirs(
   data="nacon",
-  contact="dim flex worldid dist includemargin friction solref solimp efc_address",
+  contact="dim flex geom worldid dist includemargin friction solref solimp efc_address",
   efc="aref",
 )
 class Early:
@@ -216,6 +216,8 @@ def take_early(f: Early):
   """Takes margin, and parting on organs, off threads' gaps, see `coupling/mujoco_rod.h`."""
   c = wp.tid()
   if c >= f.nacon[0]:
+    return
+  if f.geom[c][0] >= 0 and f.geom[c][1] >= 0:  # mujoco_warp leaves their flexes as they were
     return
   thread = wp.max(f.flex[c][0], f.flex[c][1])
   if thread >= f.nthread:

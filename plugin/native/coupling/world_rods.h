@@ -74,9 +74,10 @@ struct WorldRod {
       const int c = f.id.data[r], dim = f.contact_dim.data[c];
       const bool paired = type[r] == CONTACT_PYRAMIDAL;
       count = paired ? 2 * (dim - 1) : dim;
-      const int* flex = (const int*)f.contact_flex.data + 2 * c;
+      const int *flex = (const int*)f.contact_flex.data + 2 * c, *geom = (const int*)f.contact_geom.data + 2 * c;
+      if (geom[0] >= 0 && geom[1] >= 0) continue;  // mujoco_warp leaves their flexes as they were
       if ((flex[0] != f.flex && flex[1] != f.flex) || r + count > nefc) continue;
-      if (is_open(*this, flex, (const int*)f.contact_elem.data + 2 * c, (const int*)f.contact_geom.data + 2 * c)) {
+      if (is_open(*this, flex, (const int*)f.contact_elem.data + 2 * c, geom)) {
         // mujoco_warp still has it
         for (int k = r; k < r + count; ++k) {
           const auto own = row(k);
