@@ -61,6 +61,46 @@ def test_a_thread_slides_through_a_hole_as_around_a_capstan():
   assert np.linalg.norm(hole.force) == pytest.approx(ENERGY * THICK, rel=0.03)
 
 
+def test_holes_that_meet_on_a_thread_slide_on_together():
+  """Two strands draw a bite up until its holes meet, and rest there; they share what friction is.
+
+  Pulled on at one end, the thread goes round both: T exp(mu pi). It slid by itself before.
+  """
+  mu, edge, up = 0.3, 1e-3, 0.03
+  spec = mujoco.MjSpec()
+  spec.option.timestep, spec.option.gravity = STEP, (0, 0, 0)
+  line = np.array([(1.1e-3, 0, up), (1.1e-3, 0, -2e-4), (-1.1e-3, 0, -2e-4), (-1.1e-3, 0, up)])
+  nodes = int(np.linalg.norm(np.diff(line, axis=0), axis=1).sum() / edge) + 1
+  straight = line[0] + edge * np.arange(nodes)[:, None] * (0, 0, 1)
+  contact = {"friction": mu, "contype": 0, "conaffinity": 0}
+  palpate.add_thread(spec, straight, "suture", strength=0, bend=0, contact=contact)
+  aside = spec.worldbody.add_body(name="hand", pos=line[0] + (0, RADIUS, 0))
+  palpate.add_needle(spec, length=LENGTH, parent=aside, thread="suture")
+  spec.equality("needle_suture").active = False
+  surface, rim = sheet()
+  given = SHEET | {"young": 1e5, "mass": 0.05, "damping": 0.01, "pin": rim, "device": "cpu"}
+  palpate.add_organ(spec, surface, needles="needle 8000", **given)
+  model, data, organ = load(spec)
+  palpate.Thread(model, data, "suture").lay(line)
+  organ.sew("needle")
+  head, tail = ({node: np.array([0.0, 0.0, 0.2])} for node in (0, nodes - 1))
+  for start, end in ((0.001, 1.0), (1.0, 1.0)):
+    for _ in pull(model, data, head | tail, start, end, 300):
+      pass
+  assert np.abs(organ.xvel).max() < 1e-5
+  rest, held, between = organ.pinholes[0].along, 1.0, []
+  for k, _ in enumerate(pull(model, data, head, 1.0, 3.5, 1000)):
+    held = 1.0 + 2.5 * k / 1000
+    first, second = organ.pinholes
+    between.append(second.along - first.along)
+    if abs(first.along - rest) > edge:
+      break
+  assert held == pytest.approx(np.exp(mu * np.pi), rel=0.1)
+  assert between[-1] == pytest.approx(2 * edge)  # one edge of it is in neither hole
+  assert min(between) > 2 * edge - 1e-9
+  assert organ.error is None
+
+
 def test_a_thread_goes_through_both_layers_of_a_wall_and_tears_the_weaker_one():
   """It follows the needle down and up, four holes in all; layers in touch do not pinch it.
 

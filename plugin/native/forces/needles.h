@@ -333,25 +333,50 @@ PALPATE Sym across_and_along(double a, double b, D3 n) {
   return {a + c * n.x * n.x, c * n.x * n.y, c * n.x * n.z, a + c * n.y * n.y, c * n.y * n.z, a + c * n.z * n.z};
 }
 
-// A hole's thread: the edge that is in it, the share of that, and how it is there. It turns by `angle` between edges
-// beside that, far enough for a thread that resists bending; the needle itself is what is before the first one. It slides along the mean of both, so that equal
-// tensions do not make it slide wherever on the edge it is.
-struct Passing { int edge; double part, angle; D3 at, along; };
+PALPATE int within(int a, int low, int high) { return a < low ? low : a > high ? high : a; }
+
+// Where the next hole towards the needle, or with -1 the one before, is on the thread; 0 if on none.
+PALPATE double next_on_thread(double* s, int n, int way) {
+  const int other = n + way;
+  return other >= 0 && other < (int)s[NEEDLE_COUNT] ? hole(s, other)[HOLE_THREAD] : 0.0;
+}
+
+// A hole's thread: the edge that is in it, the share of that, how it is there, and how far it is ahead of its seat. It
+// turns by `angle` between edges beside that, far enough for a thread that resists bending but not past the next hole; the
+// needle itself is what is before the first one. It slides along the mean of both, so that equal tensions do not make it
+// slide wherever on the edge it is.
+struct Passing { int edge; double part, angle, off; D3 at, along; Seat seat; };
 
 template <class Fields>
-CALLED Passing passing(const Fields& f, int i, const Arc& arc, double place) {
+CALLED Passing passing(const Fields& f, int i, const Arc& arc, double* s, int n) {
   const auto thread = strand_of(f, i);
   Passing out;
-  const int e = out.edge = thread.find(place, out.part);
+  const int e = out.edge = thread.find(hole(s, n)[HOLE_THREAD], out.part);
   const D3 from = thread.at(e), to = thread.at(e + 1), zero = {0.0, 0.0, 0.0};
   out.at = (1.0 - out.part) * from + out.part * to;
-  const int first = e > BESIDE ? e - BESIDE : 0, last = e + BESIDE + 2 < thread.count ? e + BESIDE : thread.count - 2;
-  const D3 before = e ? unit_of(thread.at(first + 1) - thread.at(first)) : zero - arc.along(0.0);
+  int first = e > BESIDE ? e - BESIDE : 0, last = e + BESIDE + 2 < thread.count ? e + BESIDE : thread.count - 2;
+  const double next = next_on_thread(s, n, 1), previous = next_on_thread(s, n, -1);
+  double part;
+  if (next > 0.0) first = within(thread.find(next, part) + 1, first, e);
+  if (previous > 0.0) last = within(thread.find(previous, part) - 1, e, last);
+  const D3 before = e || next > 0.0 ? unit_of(thread.at(first + 1) - thread.at(first)) : zero - arc.along(0.0);
   const D3 after = unit_of(thread.at(last + 1) - thread.at(last));
   const D3 both = before + after;
   out.angle = atan2(norm(cross(before, after)), dot(before, after));
   out.along = norm(both) > 1e-6 ? unit_of(both) : unit_of(to - from);
+  out.seat = seat_of_hole(f, s, n);
+  out.off = dot(out.at - out.seat.at, out.along);
   return out;
+}
+
+// How far a hole can slide along a thread, to the next one, or with -1 to the one before: between two there is an edge, which
+// tells how the thread turns in them and what it bears.
+template <class Fields>
+PALPATE double room_on_thread(const Fields& f, int i, double* s, int n, int way, int edge) {
+  const auto thread = strand_of(f, i);
+  const double other = next_on_thread(s, n, way), apart = BESIDE * thread.edge(edge);
+  const double room = way * (hole(s, n)[HOLE_THREAD] - other) - apart;
+  return other == 0.0 ? 2.0 * thread.length() : room > ENDS * apart ? room : 0.0;
 }
 
 // Length in tissue at a hole: a sheet's thickness; in a solid half the way to each hole next to it, from the last one to
@@ -437,32 +462,47 @@ PALPATE void tear_by_thread(const Fields& f, Thread t, int i, const Arc& arc, do
 // What friction of a thread in a hole bears along it, of the difference of the tensions on both sides of the edge that is
 // in it.
 template <class Fields>
-CALLED double thread_friction(const Fields& f, int i, const Arc& arc, const Passing& by, const Seat& seat, double* s,
-                               int n) {
+CALLED double rubs(const Fields& f, int i, const Arc& arc, const Passing& by, double* s, int n) {
   const double* law = f.law.data + PIERCE_LENGTH * i;
   const auto thread = strand_of(f, i);
   const int e = by.edge;
-  const bool last = e + 2 == thread.count;
-  if (law[PIERCE_STOP] > 0.0 && last && by.part > 1.0 - ENDS && dot(by.at - seat.at, by.along) < 0.0) return STOPS;
-  const double back = last ? 0.0 : thread.tension(e + 1), pull = thread.tension(e ? e - 1 : 0);
+  const double back = e + 2 == thread.count ? 0.0 : thread.tension(e + 1), pull = thread.tension(e ? e - 1 : 0);
   const double most = (pull < back ? pull : back) * (exp(law[PIERCE_CAPSTAN] * by.angle) - 1.0);
   const double share = cos(0.5 * by.angle);
   return (share > HAIRPIN ? share : HAIRPIN) * (most + law[PIERCE_FRICTION] * length_in(f, i, arc, s, n));
 }
 
+// What a hole bears along a thread. One that has met the next presses on that, and slides on with it alone: all that have
+// met bear together what all of them rub.
+template <class Fields>
+CALLED double thread_friction(const Fields& f, int i, const Arc& arc, const Passing& by, double* s, int n) {
+  const double* law = f.law.data + PIERCE_LENGTH * i;
+  const int way = by.off > 0.0 ? 1 : -1;
+  const bool last = by.edge + 2 == strand_of(f, i).count;
+  if (law[PIERCE_STOP] > 0.0 && last && by.part > 1.0 - ENDS && way < 0) return STOPS;
+  double sum = rubs(f, i, arc, by, s, n);
+  for (int edge = by.edge; room_on_thread(f, i, s, n, way, edge) == 0.0;) {
+    const Passing other = passing(f, i, arc, s, n += way);
+    const double left = rubs(f, i, arc, other, s, n) - law[PIERCE_STIFFNESS] * way * other.off;
+    sum += left > 0.0 ? left : 0.0;
+    edge = other.edge;
+  }
+  return sum;
+}
+
 // Follows a thread that has slid through a hole: the place that holds it goes on along the thread by as much as its spring
-// is longer than friction bears.
+// is longer than friction bears, until it meets the next hole.
 template <class Fields>
 PALPATE void follow_thread(const Fields& f, int i, const Arc& arc, double* s, int n) {
   const auto thread = strand_of(f, i);
   double& place = hole(s, n)[HOLE_THREAD];
-  const Passing by = passing(f, i, arc, place);
-  const Seat seat = seat_of_hole(f, s, n);
-  const D3 p = seat.at;
-  const double off = dot(by.at - p, by.along);
-  const double slack = thread_friction(f, i, arc, by, seat, s, n) / f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
-  if (fabs(off) <= slack) return;
-  place -= off > 0.0 ? off - slack : off + slack;
+  const Passing by = passing(f, i, arc, s, n);
+  const D3 p = by.seat.at;
+  const double slack = thread_friction(f, i, arc, by, s, n) / f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
+  if (fabs(by.off) <= slack) return;
+  const int way = by.off > 0.0 ? 1 : -1;
+  const double goes = fabs(by.off) - slack, room = room_on_thread(f, i, s, n, way, by.edge);
+  place -= way * (goes < room ? goes : room);
   const double whole = thread.length();
   place = place < whole ? place : whole;
   if (place > 0.0) return;
@@ -475,12 +515,11 @@ PALPATE void follow_thread(const Fields& f, int i, const Arc& arc, double* s, in
 // Holds a thread in a hole: by the force that its step has found, and less as the tissue then follows it.
 template <class Fields>
 PALPATE void tie_thread(const Fields& f, Thread t, int i, int n, const Arc& arc, double weight, double* s) {
-  const Seat seat = seat_of_hole(f, s, n);
-  const Passing by = passing(f, i, arc, hole(s, n)[HOLE_THREAD]);
-  const double most = thread_friction(f, i, arc, by, seat, s, n);
-  const bool sticks = f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS] * fabs(dot(by.at - seat.at, by.along)) < most;
+  const Passing by = passing(f, i, arc, s, n);
+  const double most = thread_friction(f, i, arc, by, s, n);
+  const bool sticks = f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS] * fabs(by.off) < most;
   const D3 force = load(f.pull.data + 3 * (POINTS * i + n));
-  tie(f, t, POINTS * i + n, seat, by.at, force, across_and_along(weight, sticks ? weight : 0.0, by.along), false);
+  tie(f, t, POINTS * i + n, by.seat, by.at, force, across_and_along(weight, sticks ? weight : 0.0, by.along), false);
 }
 
 // Closes holes that the tip has been drawn out of, and lets go of those that the swage has left, or hands them to the
@@ -611,15 +650,15 @@ PALPATE void aim_thread(const Fields& given, Thread t, int i) {
     const int at = all.tie_count.data[0];
     if (!on_thread(s, n) || at == MOST_TIES) continue;
     double* tie = all.tie_value.data + TIE_LENGTH * at;
-    const Seat seat = seat_of_hole(f, s, n);
-    const Passing by = passing(f, i, arc, hole(s, n)[HOLE_THREAD]);
+    const Passing by = passing(f, i, arc, s, n);
+    const Seat& seat = by.seat;
     D3 vel = {0.0, 0.0, 0.0};
     for (int c = 0; c < seat.count; ++c) vel += seat.share[c] * goes_by(f.mj, f.own, seat.vert[c]);
     const D3 goes = in_world(f.own.frame.data, f.own.origin.data, seat.at + f.mj.timestep.data[0] * vel);
     store(tie + TIE_AIM, add_turned({0.0, 0.0, 0.0}, all.frame.data, goes - load(all.origin.data)));
     tie[TIE_PART] = by.part;
     tie[TIE_STIFFNESS] = f.law.data[PIERCE_LENGTH * i + PIERCE_STIFFNESS];
-    tie[TIE_FRICTION] = thread_friction(f, i, arc, by, seat, s, n);
+    tie[TIE_FRICTION] = thread_friction(f, i, arc, by, s, n);
     tie[TIE_BEARS] = bears_across(f, i, arc, s, n);
     store(tie + TIE_ALONG, add_turned({0.0, 0.0, 0.0}, all.frame.data, turned(f.own.frame.data, by.along)));
     all.tie_edge.data[at] = by.edge;
