@@ -268,19 +268,20 @@ def test_two_grips_that_pull_against_each_other_tear_what_they_hold_and_throw_no
   spec.option.tolerance = 1e-12
   model, data, organ = load(spec)
   drive(model, data, organ, [2.9 if solid else 2.2], speed=6.0)
-  holes, torn, bears = len(organ.needles[0].holes), [0.0], []
+  holes, torn, bears, largest = len(organ.needles[0].holes), [0.0], [], 0.0
   ways = np.eye(3)[[1, 0, 2] if solid else [2]]
-  for now, speed in pulled_apart(model, data, organ, ways, 0.7):
+  for now, speed in pulled_apart(model, data, organ, ways, 0.76):  # as far as they go back
     assert speed < 0.5
-    torn.append(max((hole.torn for hole in now.holes), default=0.0))
-    bears.append(max((np.linalg.norm(hole.force) for hole in now.holes), default=0.0))
+    found = [(hole.torn, np.linalg.norm(hole.force)) for hole in now.holes] or [(0.0, 0.0)]
+    largest = max(largest, *(force for _, force in found))
+    for each, value in zip((torn, bears), max(found), strict=True):  # of the one most torn
+      each.append(value)
   assert np.isfinite(data.qpos).all() and not data.warning.number.any()
   assert organ.error is None
   assert max(torn) > 5e-4 or len(organ.needles[0].holes) < holes
   most = 300 * SLIT if solid else ENERGY * THICK  # what the surface bears, or the wall
-  assert max(bears) < 2 * most
-  if not solid:
-    assert np.median(np.array(bears)[np.diff(torn) > 0]) == pytest.approx(most, rel=0.2)
+  assert largest < 2 * most
+  assert np.median(np.array(bears)[np.diff(torn) > 0]) == pytest.approx(most, rel=0.2)
 
 
 def test_a_pinhole_stays_where_it_is_beside_a_cut():
