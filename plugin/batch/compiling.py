@@ -5,9 +5,9 @@ Launched one after the other, each is compiled as it is met: minutes on a GPU's 
 
 from __future__ import annotations
 
-import collections
 import os
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
@@ -22,11 +22,11 @@ def compile_ahead(device: wp.Device, works: Iterable[Callable[[], Any]]):
 
   What they copy and fill is done.
   """
-  found: dict[int, dict[Any, None]] = collections.defaultdict(dict)
+  found: dict[tuple[Any, int], None] = {}
 
   def note(kernel, *args, block_dim: int | None = None, **kwargs):
     if not kernel.is_generic:  # these are known by what they are launched with
-      found[block_dim or _BLOCK][kernel.module] = None
+      found[kernel.module, block_dim or _BLOCK] = None
 
   def once(condition, while_body, **kwargs):
     while_body(**kwargs)
@@ -34,5 +34,7 @@ def compile_ahead(device: wp.Device, works: Iterable[Callable[[], Any]]):
   with instead([(wp, "launch", note), (wp, "launch_tiled", note), (wp, "capture_while", once)]):
     for work in works:
       work()
-  for block_dim, modules in found.items():
-    wp.force_load(device, [*modules], block_dim, max_workers=os.cpu_count())
+  # One pool: `force_load` has one for each size of blocks, and waits for its slowest module.
+  with ThreadPoolExecutor(os.cpu_count()) as pool:
+    for job in [pool.submit(wp.force_load, device, [each], size, 0) for each, size in found]:
+      job.result()

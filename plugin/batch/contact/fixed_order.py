@@ -36,9 +36,11 @@ _FRICTION = wp.constant(int(ConstraintType.FRICTION_DOF))
 _PAIR = wp.constant(64)  # contacts of two geoms, at most
 # Contacts of a world's geoms that are put in order; more stay as they came.
 _ROOM = wp.constant(64)
-_LANES = wp.constant(16)  # threads that share a row
+_LANES = wp.constant(8)  # threads that share a row
+_SIDE = wp.constant(4)  # dofs of a block of the Hessian, which is a thread's
 _TERMS = wp.constant(16)  # of a sum of the Hessian that are added up by themselves
 _BLOCK = 256  # threads of a world
+_SENSED = 32  # threads of a touch sensor
 _CONE = wp.constant(int(ConstraintState.CONE))
 _QUADRATIC = wp.constant(int(ConstraintState.QUADRATIC))
 
@@ -66,7 +68,7 @@ class Pairs:
 @theirs(
   option="impratio_invsqrt",
   data="nefc dof_frictionadr",
-  contact="friction efc_address",
+  contact="dim friction efc_address",
   efc="type id D state force J J_colind",
 )
 class Rows:
@@ -75,9 +77,9 @@ class Rows:
   moved: Array(Column, ("ncolumn",))  # what moves: `_COLUMNS`
   part: ints("nworld", "njmax")  # which of its contact's rows
   kept: Array(Column, ("ncolumn",))  # of what is moved
-  # What sums over them need:
-  whole: floats("nworld", "njmax", "nv")  # J, of all dofs
-  weighed: floats("nworld", "njmax", "nv")  # D J, or the curvature of a cone times J
+  # What sums over them need, of all dofs and some that pad the last block:
+  whole: floats("nworld", "njmax", "npad")  # J
+  weighed: floats("nworld", "njmax", "npad")  # D J, or the curvature of a cone times J
 
 
 @theirs(
@@ -166,7 +168,7 @@ def _sort_rows(r: Rows):
   w, lane = wp.tid()
   lanes = wp.block_dim()
   n = _count(r, w)
-  nv = r.whole.shape[2]
+  npad = r.whole.shape[2]
   for k in range(lane, n, lanes):
     key = _row_key(r, w, k)
     to = int(0)  # noqa: RUF046, UP018 - a variable to Warp
@@ -181,8 +183,8 @@ def _sort_rows(r: Rows):
     for f in range(r.moved.shape[0]):
       kept = r.kept[f].words
       kept[w, to] = r.moved[f].words[w, k]
-  for q in range(lane, n * nv, lanes):
-    r.whole[w, q / nv, q % nv] = 0.0
+  for q in range(lane, n * npad, lanes):
+    r.whole[w, q / npad, q % npad] = 0.0
   meet_block()
   for k in range(lane, n, lanes):
     for f in range(r.moved.shape[0]):
@@ -204,14 +206,14 @@ def _bend(
 ):  # fmt: skip
   """Weighs a row of a contact whose force is on its cone, by mujoco_warp's curvature of that."""
   head = k - r.part[w, k]
-  friction = r.friction[r.id[w, k]]
+  c = r.id[w, k]
+  friction = r.friction[c]
   mu = friction[0] * r.impratio_invsqrt[w % r.impratio_invsqrt.shape[0]]
-  dim = int(1)  # noqa: RUF046, UP018 - a variable to Warp
-  square = float(0.0)  # noqa: UP018
-  while head + dim < n and r.part[w, head + dim] == dim:
-    u = Jaref[w, head + dim] * friction[dim - 1]
+  dim = wp.min(r.dim[c], n - head)
+  square = float(0.0)  # noqa: UP018 - a variable to Warp
+  for d in range(1, dim):
+    u = Jaref[w, head + d] * friction[d - 1]
     square += u * u
-    dim += 1
   t = wp.max(wp.sqrt(square), 1e-15)
   ratio = mu * Jaref[w, head] * mu / t
   curve = mu * mu - ratio
@@ -249,6 +251,12 @@ def _weigh(r: Rows, Jaref: wp.array2d[float], w: int, n: int, k: int, lane: int,
       r.weighed[w, k, i] = weight * r.whole[w, k, i]
 
 
+@wp.func
+def _four(rows: wp.array3d[float], w: int, k: int, i: int):
+  """Returns what a row has at the dofs of a block."""
+  return wp.vec4(rows[w, k, i], rows[w, k, i + 1], rows[w, k, i + 2], rows[w, k, i + 3])
+
+
 @wp.kernel(enable_backward=False)
 def _update(
   r: Rows, Jaref: wp.array2d[float], smooth: wp.array2d[float], Ma: wp.array2d[float],
@@ -262,49 +270,52 @@ def _update(
   if done[w]:
     return
   n = _count(r, w)
-  nv = r.whole.shape[2]
+  nv = qfrc.shape[1]
   lanes = wp.min(_LANES, wp.block_dim())
   for k in range(thread / lanes, n, wp.block_dim() / lanes):
     _weigh(r, Jaref, w, n, k, thread % lanes, lanes)
+  meet_block()
   mine = float(0.0)  # noqa: UP018 - a variable to Warp
-  for i in range(thread, nv, wp.block_dim()):
-    total = float(0.0)  # noqa: UP018
-    for k in range(n):
-      total += r.whole[w, k, i] * r.force[w, k]
-    g = Ma[w, i] - smooth[w, i] - total
-    qfrc[w, i] = total
-    grad[w, i] = g
-    mine += g * g
+  side = r.whole.shape[2] / _SIDE
+  for block in range(thread, side * (side + 1) // 2, wp.block_dim()):
+    column = int((wp.sqrt(float(8 * block + 1)) - 1.0) * 0.5)
+    row = block - column * (column + 1) // 2
+    i, j = _SIDE * row, _SIDE * column
+    curve = wp.mat44()
+    total = wp.vec4()
+    for first in range(0, n, _TERMS):
+      terms = wp.mat44()
+      for k in range(first, wp.min(first + _TERMS, n)):
+        own = _four(r.whole, w, k, i)
+        terms += wp.outer(own, _four(r.weighed, w, k, j))
+        total += r.force[w, k] * own
+      curve += terms
+    for a in range(_SIDE):
+      if row == column and i + a < nv:
+        g = Ma[w, i + a] - smooth[w, i + a] - total[a]
+        qfrc[w, i + a] = total[a]
+        grad[w, i + a] = g
+        mine += g * g
+      for b in range(_SIDE):
+        if i + a <= j + b and j + b < nv:
+          h[w, i + a, j + b] = h[w, i + a, j + b] + curve[a, b]
   whole = wp.tile_reduce(wp.add, wp.tile(mine, preserve_type=True))
   if thread == 0:
     square[w] = whole[0]
     decrement[w] = 0.0
     scale[w] = 1.0
-  meet_block()
-  if n == 0:
-    return
-  for entry in range(thread, nv * (nv + 1) // 2, wp.block_dim()):
-    j = int((wp.sqrt(float(8 * entry + 1)) - 1.0) * 0.5)
-    i = entry - j * (j + 1) // 2
-    curve = h[w, i, j]
-    for first in range(0, n, _TERMS):
-      terms = float(0.0)  # noqa: UP018
-      for k in range(first, wp.min(first + _TERMS, n)):
-        terms += r.whole[w, k, i] * r.weighed[w, k, j]
-      curve += terms
-    h[w, i, j] = curve
 
 
 @wp.kernel(enable_backward=False)
 def _touch(r: Rows, t: Touches):
   """Adds up the normal forces of contacts of a touch sensor's body that its site sees."""
-  w, s = wp.tid()
+  w, s, lane = wp.tid()
   sensor = t.sensor_touch_adr[s]
   site = t.sensor_objid[sensor]
   body = t.site_bodyid[site]
   n = _count(r, w)
-  total = float(0.0)  # noqa: UP018 - a variable to Warp
-  for k in range(n):
+  mine = float(0.0)  # noqa: UP018 - a variable to Warp
+  for k in range(lane, n, wp.block_dim()):
     if r.type[w, k] >= _CONTACT and r.part[w, k] == 0:
       c = r.id[w, k]
       geom = t.geom[c]
@@ -322,8 +333,10 @@ def _touch(r: Rows, t: Touches):
         at, turn, size = t.site_xpos[w, site], t.site_xmat[w, site], t.site_size[site]
         far, _normal = private.ray_geom(at, turn, size, t.pos[c], way, t.site_type[site])
         if force > 0.0 and far >= 0.0:
-          total += force
-  t.sensordata[w, t.sensor_adr[sensor]] = total
+          mine += force
+  total = wp.tile_reduce(wp.add, wp.tile(mine, preserve_type=True))
+  if lane == 0:
+    t.sensordata[w, t.sensor_adr[sensor]] = total[0]
 
 
 # In place of kernels of mujoco_warp's, with their arguments.
@@ -442,7 +455,8 @@ class FixedOrder:
       **arrays_of(Rows, m, d),
       part=np.zeros(shape),
     )
-    values |= {name: np.zeros((*shape, m.nv)) for name in ("whole", "weighed")}
+    npad = -(-m.nv // _SIDE) * _SIDE
+    values |= {name: np.zeros((*shape, npad)) for name in ("whole", "weighed")}
     values |= self._room_for([getattr(efc, name) for name in _COLUMNS])
     self._rows = fill(Rows, device, values)
     each = [getattr(contact, name.name) for name in dataclasses.fields(contact)]
@@ -521,7 +535,8 @@ class FixedOrder:
 
     def feel(m, d, *args, **kwargs):
       dim = d.nworld, self._touches.sensor_touch_adr.size
-      wp.launch(_touch, dim=dim, inputs=[self._rows, self._touches])
+      inputs = [self._rows, self._touches]
+      wp.launch_tiled(_touch, dim=dim, inputs=inputs, block_dim=_SENSED)
       evaluate(m, d, *args, **kwargs)
 
     return private.instead([
