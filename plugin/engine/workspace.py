@@ -440,11 +440,6 @@ def set_motion(w: Workspace, model: int, u: np.ndarray | None, v: np.ndarray | N
     place(w, model)
 
 
-def rebind(w: Workspace):
-  """Records the graphs of a workspace anew."""
-  bind(w, w.model)
-
-
 def attach(w: Workspace, model: int):
   """Makes a workspace fit a living model, which need not be the one that it last ran with."""
   if not w.seen.identity.is_of(model):
