@@ -146,10 +146,7 @@ def _areas(host: Host, vert: np.ndarray, name: str, near: float) -> np.ndarray:
 def _normals(host: Host, now: bool) -> np.ndarray:
   """Returns the unit normals of an organ's vertices in the world, (nouter, 3)."""
   mesh = host.organ.mesh
-  x = host.places(np.arange(mesh.nouter), now)
-  out = np.zeros((mesh.nouter, 3))
-  np.add.at(out, mesh.elem, topology.area_vectors(x, mesh.elem)[:, None])
-  return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
+  return topology.vertex_normals(host.places(np.arange(mesh.nouter), now), mesh.elem)
 
 
 def _far_from_geoms(m: mjstruct.Struct, body: int, points: np.ndarray) -> np.ndarray:
