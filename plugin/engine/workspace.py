@@ -457,7 +457,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     w = Workspace(host, Seen(instance), Report(host.flags().numpy().data))
     if organ.windows:
       w.turn = Turn()
-    _view(w, mjstruct.Data.from_address(data), m)
+    _view(w, mjstruct.Data.from_address(data))
     prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
     mass = np.where(body.shape.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
@@ -476,7 +476,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     return w
 
 
-def _view(w: Workspace, d: mjstruct.Struct, m: mjstruct.Struct):
+def _view(w: Workspace, d: mjstruct.Struct):
   """Takes views of an mjData that every step looks at."""
   fields = mjstruct.Data
   w.seen.status = w.host.arrays["status"].numpy()[0].data
