@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -217,11 +216,6 @@ class Workspace:
     """What it rests on."""
     return self.forces.of(Supports)
 
-  @property
-  def boxes(self) -> Mapping[str, Any]:
-    """Blocks of the plugin state and of what crosses in a step, see `layout`; windows."""
-    return self.graphs.phases.boxes
-
   def share(self, values: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
     """Returns what cuts have made of values by mass of vertices, some or all, (n,)."""
     return self.cuts.share(values, vert) if self.cuts else values[vert]
@@ -373,7 +367,7 @@ class Workspace:
   def _answer(self):
     """Ends the step with the organ's own response to the change of the contact forces."""
     if self.turn is not None:
-      self.boxes["inbox"].head.numpy()[HEAD.answered] = 1.0
+      self.graphs.phases.boxes["inbox"].head.numpy()[HEAD.answered] = 1.0
     graphs.launch_all(self.graphs.respond)
     if self.graphs.resident:
       self.report.flags[FLAG.pending] = 0
