@@ -29,6 +29,13 @@ class Pose(NamedTuple):
   head: float
 
 
+def upright(back: np.ndarray) -> np.ndarray:
+  """Returns the axes of a level picture in columns: right, up, and back, a unit vector  (3, 3)."""
+  right = np.cross([0.0, 0.0, 1.0], back)
+  right /= np.linalg.norm(right)
+  return np.column_stack([right, np.cross(back, right), back])
+
+
 def turned(optics: float) -> np.ndarray:
   """Returns how the body `eye` is turned against the tip, w x y z."""
   return np.array([math.cos(optics / 2), -math.sin(optics / 2), 0.0, 0.0])

@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
-from . import catalog, markup, texture
+from . import catalog, laparoscope, markup, texture
 from .meshing import grid
 
 # Axis of a texture's middle in the organ's frame: that of the exercises' laparoscopes.
@@ -95,9 +95,7 @@ def _sphere(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
   left, _, right = np.linalg.svd(points.T @ away)
   flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
   z = np.array(VIEW) / np.linalg.norm(VIEW)
-  x = np.cross([0.0, 0.0, 1.0], z)
-  x /= np.linalg.norm(x)
-  return points @ (left @ flip @ right) @ np.stack([x, np.cross(z, x), z], axis=1)
+  return points @ (left @ flip @ right) @ laparoscope.upright(z)
 
 
 @functools.lru_cache(maxsize=8)

@@ -23,9 +23,8 @@ class Bonds:
   def _groups(self) -> list[Group]:
     return self._space.bonds.groups
 
-  def _all(self, name: str, width: tuple[int, ...] = ()) -> np.ndarray:
-    parts = [np.asarray(group.now[name]) for group in self._groups]
-    return np.concatenate([np.zeros((0, *width)), *parts])
+  def _all(self, name: str) -> np.ndarray:
+    return np.concatenate([np.zeros(0), *(group.now[name] for group in self._groups)])
 
   @property
   def _state(self) -> np.ndarray:

@@ -77,7 +77,8 @@ class Inputs:
     return spec.function(**given)
 
   def _get(self, metric: str, name: str) -> Any:
-    if name == "time" or isinstance(getattr(type(self), name, None), property):
+    kinds = property, functools.cached_property
+    if name == "time" or isinstance(getattr(type(self), name, None), kinds):
       return getattr(self, name)
     if name in self._settings:
       value = self._settings[name]
@@ -96,14 +97,10 @@ class Inputs:
     return self._path(0)
 
   @functools.cached_property
-  def _turned(self) -> np.ndarray | None:
-    quat, cutoff = self._recording.column("quat", self._which[0]), self._settings["tip_cutoff"]
-    return quat if quat is None or cutoff is None else m.low_pass_rotation(self.time, quat, cutoff)
-
-  @property
   def quat(self) -> np.ndarray | None:
     """Tip orientation, w x y z  (nstep, 4)."""
-    return self._turned
+    quat, cutoff = self._recording.column("quat", self._which[0]), self._settings["tip_cutoff"]
+    return quat if quat is None or cutoff is None else m.low_pass_rotation(self.time, quat, cutoff)
 
   @property
   def axis(self) -> np.ndarray | None:

@@ -186,7 +186,7 @@ PLACES = {
   "native code in headers": (PACKAGE, r"\.func_native\b", ("plugin/tissue/kernels.py",)),
   "private modules of others": (
     PACKAGE, r"(?m)^ *(from|import) .*\._src\b",
-    ("plugin/batch/private.py", "plugin/tissue/device.py"),
+    ("plugin/batch/mjw/private.py", "plugin/tissue/device.py"),
   ),
   "writers of flexcomps": (
     PACKAGE, r"<flexcomp\s+\w+=\"|\.add_flex\(",

@@ -96,3 +96,7 @@ def _parser(words: list[str]) -> argparse.ArgumentParser:
       chosen.add_arguments(command)
       command.set_defaults(main=chosen.main, parser=command)
   return parser
+
+
+if __name__ == "__main__":
+  sys.exit(main())

@@ -14,13 +14,10 @@ from .console import CommandError
 def add_argument(parser: argparse.ArgumentParser):
   """Declares the option."""
   parser.add_argument(
-    "--set",
-    metavar="NAME=VALUE",
-    action="append",
-    default=[],
+    "--set", metavar="NAME=VALUE", action="append", default=[],
     help="option of the exercise, such as reward=sparse, time_limit=5 or pixels=[84,84]; JSON or a "
     "word; may be repeated",
-  )
+  )  # fmt: skip
 
 
 def add_observations(parser: argparse.ArgumentParser):

@@ -24,10 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser):
   )
   add = parser.add_argument
   add(
-    "mesh",
-    metavar="MESH",
+    "mesh", metavar="MESH",
     help="OBJ, STL, PLY, glTF; a volume in NIfTI or NRRD; the folder of a DICOM series",
-  )
+  )  # fmt: skip
   add(
     "-o", "--out", metavar="FOLDER", required=True, help="the model folder to write, new or empty"
   )
@@ -36,17 +35,13 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--method", choices=("even", "grid", "direct"), default="even", help="(%(default)s)")
   add("--scale", metavar="X", help="metres per unit of a mesh, or its unit: m, cm, mm, inch (m)")
   add(
-    "--label",
-    metavar="K",
-    action="append",
+    "--label", metavar="K", action="append",
     help="number or name of a label of a volume, or all; may be repeated",
-  )
+  )  # fmt: skip
   add(
-    "--threshold",
-    metavar="X",
-    type=float,
+    "--threshold", metavar="X", type=float,
     help="lowest value of the organ in a scan, which need be no label map (CT: Hounsfield units)",
-  )
+  )  # fmt: skip
   add("--upper", metavar="X", type=float, default=math.inf, help="highest value of the organ")
   add("--pieces", action="store_true", help="make an organ of every separate piece")
   add("--accept-losses", action="store_true", help="write the organ even if it leaves parts out")

@@ -259,8 +259,9 @@ class Batch(abc.ABC):
     self._check(data)
     self._start(data)
 
+  @abc.abstractmethod
   def _start(self, data: mujoco.MjData):
-    raise ValueError("a batch on a GPU cannot start from a state of yours yet")
+    """Takes that state."""
 
   def pose(self, joints: Sequence[str], values, mask=None):
     """Puts joints of worlds at positions, without velocity.
@@ -283,8 +284,9 @@ class Batch(abc.ABC):
     self._fresh = False
     self._pose(np.array(adr, int).reshape(-1, 2), values, self.checked(mask))
 
+  @abc.abstractmethod
   def _pose(self, adr: np.ndarray, values: Any, mask: wp.array):
-    raise ValueError("a batch on a GPU cannot pose joints yet")
+    """Puts numbers of qpos, and dofs at rest, whose places are the columns of `adr`."""
 
   def place(self, body: str, pos, quat, mask=None):
     """Moves a body of worlds in its parent's frame, one that has no joint.
@@ -304,8 +306,9 @@ class Batch(abc.ABC):
     self._fresh = False
     self._place(number, pos, quat, self.checked(mask))
 
+  @abc.abstractmethod
   def _place(self, body: int, pos: Any, quat: Any, mask: wp.array):
-    raise ValueError("a batch on a GPU cannot place bodies a world yet")
+    """Moves a body."""
 
   def _rows(self, values, name: str, count: int) -> Any:
     if not (isinstance(values, wp.array) and self.device.is_cuda):

@@ -14,7 +14,7 @@ from .base import on_device
 from .kernels import HELD, BondLists, share_freed, show_bonds, weaken_bonds
 
 if TYPE_CHECKING:
-  from .organs import Organ
+  from .organ.organ import Organ
 
 
 class Bonds(abc.ABC):

@@ -5,8 +5,8 @@ from typing import Any
 import warp as wp
 from palpate.tissue.types import Array, doubles, floats, ints, struct
 
-from .patch import Patch
-from .warp_arrays import theirs
+from .mjw.arrays import theirs
+from .organ.patch import Patch
 
 HELD = wp.constant(1.0 - 2.0**-24)  # the most damage that leaves a bond, in float32
 

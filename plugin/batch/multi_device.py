@@ -104,45 +104,34 @@ class Several(Batch):
       part.step(n)
 
   def _each(self, mask: wp.array):
-    """Yields each part, its worlds, and what of a mask is theirs."""
+    """Yields each part, which is to change, its worlds, and what of a mask is theirs."""
     whole = mask.numpy()
     for at, part in zip(self.slices, self.parts, strict=True):
+      part._fresh = False
       yield part, at, on_device(whole[at], wp.bool, part.device)
 
   def _reset(self, mask: wp.array):
     for part, _, own in self._each(mask):
-      part.reset(own)
+      part._reset(own)
     self.ctrl.assign(np.where(mask.numpy()[:, None], 0.0, self.ctrl.numpy()))
 
   def _start(self, data: mujoco.MjData):
     for part in self.parts:
-      part.start(data)
+      part._start(data)
 
-  def pose(self, joints: Sequence[str], values, mask=None):
-    """Puts joints of worlds at positions, see `Batch.pose`."""
-    values = self._rows(values, "values", len(joints))
-    self._fresh = False
-    for part, at, own in self._each(self.checked(mask)):
-      part.pose(joints, values[at], own)
+  def _pose(self, adr: np.ndarray, values: Any, mask: wp.array):
+    for part, at, own in self._each(mask):
+      part._pose(adr, values[at], own)
 
-  def place(self, body: str, pos, quat, mask=None):
-    """Moves a body of worlds in its parent's frame, see `Batch.place`."""
-    pos, quat = self._rows(pos, "pos", 3), self._rows(quat, "quat", 4)
-    self._fresh = False
-    for part, at, own in self._each(self.checked(mask)):
-      part.place(body, pos[at], quat[at], own)
+  def _place(self, body: int, pos: Any, quat: Any, mask: wp.array):
+    for part, at, own in self._each(mask):
+      part._place(body, pos[at], quat[at], own)
 
-  def configure(self, mask=None, *, gravity=None, friction=None):
-    """Changes what worlds have besides organs, see `Batch.configure`."""
-    if gravity is not None:
-      gravity = self._rows(np.broadcast_to(gravity, (self.nworld, 3)), "gravity", 3)
-    rough = {name: np.broadcast_to(v, (self.nworld,)) for name, v in (friction or {}).items()}
-    for part, at, own in self._each(self.checked(mask)):
-      mine = {name: values[at] for name, values in rough.items()}
-      part.configure(own, gravity=None if gravity is None else gravity[at], friction=mine)
-
-  def _configure(self, worlds, gravity, friction):
-    raise AssertionError("the parts do")
+  def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
+    for part, at in zip(self.parts, self.slices, strict=True):
+      mine = (worlds >= at.start) & (worlds < at.stop)
+      rough = {geom: values[mine] for geom, values in friction.items()}
+      part._configure(worlds[mine] - at.start, None if gravity is None else gravity[mine], rough)
 
   def _find(self, world: int) -> tuple[Batch, int]:
     k = next(k for k, at in enumerate(self.slices) if world < at.stop)

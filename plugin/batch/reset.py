@@ -15,7 +15,7 @@ from palpate.forces.cohesive_bonds import Bonds
 
 from . import kernels
 from .base import on_device
-from .warp_arrays import arrays_of
+from .mjw.arrays import arrays_of
 
 if TYPE_CHECKING:
   from .worlds import Worlds

@@ -20,7 +20,7 @@ from palpate.tissue.types import Array, doubles, fill, floats, ints
 
 from . import base, kernels
 from .contact.contact_rows import Early, take_early
-from .warp_arrays import arrays_of, theirs
+from .mjw.arrays import arrays_of, theirs
 
 if TYPE_CHECKING:
   from .worlds import Worlds

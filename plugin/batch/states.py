@@ -12,8 +12,9 @@ from palpate.engine import plugin as engine
 from palpate.engine.layout import TAIL
 from palpate.tissue.order import from_slices, to_slices
 
-from . import host, kernels
-from .organs import Organ
+from . import kernels
+from .organ import host
+from .organ.organ import Organ
 
 if TYPE_CHECKING:
   from .worlds import Worlds

@@ -133,11 +133,14 @@ def strip(
     _take_out(bare, bodies, organ, model)
   for instance in instances:
     bare.delete(instance)
-  masses = [_slot_mass(organ) for organ in organs]
+  # Of a slot's body, lighter than a node whatever its world's masses [kg].
+  masses = [0.1 * float(organ.mass[organ.free & (organ.mass > 0)].min()) for organ in organs]
   for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
     _add_slots(bare, organ, nslot, mass, model)
   if any(sensor.type == mujoco.mjtSensor.mjSENS_TOUCH for sensor in bare.sensors):
-    _add_last(bare, f"{organs[-1].name}_slot_{nslots[-1] - 1}")
+    # They take the other side of a flex's contact, geom -1, for the last geom: it touches nothing.
+    last = bare.body(f"{organs[-1].name}_slot_{nslots[-1] - 1}")
+    last.add_geom(size=[1e-6, 0, 0], mass=0.0, contype=0, conaffinity=0)
   bare.option.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
   _check_option(bare.option)
   made = bare.compile()
@@ -199,11 +202,6 @@ def _check_option(option):
     raise ValueError("sleep is enabled, which a batch on a GPU does not know")
 
 
-def _slot_mass(organ: Declaration) -> float:
-  """Returns the mass of a slot's body, lighter than a node whatever its world's masses [kg]."""
-  return 0.1 * float(organ.mass[organ.free & (organ.mass > 0)].min())
-
-
 def _take_out(bare, bodies: dict, organ: Declaration, model):
   """Deletes an organ's flexes and the bodies of its nodes or windows."""
   names = [flex.name for flex in bare.flexes]
@@ -238,14 +236,6 @@ def _add_slots(bare, organ: Declaration, nslot: int, mass: float, model):
   made.contype = made.conaffinity = 0
   made.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
   made.condim = int(model.flex_condim[flex])
-
-
-def _add_last(bare, body: str):
-  """Adds a geom that touches nothing, after all others.
-
-  mujoco_warp's touch sensors take the other side of a flex's contact, geom -1, for the last geom.
-  """
-  bare.body(body).add_geom(size=[1e-6, 0, 0], mass=0.0, contype=0, conaffinity=0)
 
 
 def _check(model, made, organs: list, nslots: list[int]):

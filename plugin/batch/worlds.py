@@ -22,14 +22,15 @@ from palpate.forces.cohesive_bonds import Bonds
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import host, kernels, rods, states, strip_organs
+from . import kernels, rods, states, strip_organs
 from .base import Batch
-from .compiling import compile_ahead
 from .contact import contacts, convex
 from .contact.fixed_order import FixedOrder, is_enough
 from .contact.rounding import Rounding
-from .organs import Organ
-from .private import DeterminismType, OverflowType
+from .mjw.compiling import compile_ahead
+from .mjw.private import DeterminismType, OverflowType
+from .organ import host
+from .organ.organ import Organ
 from .reset import Rest
 
 _CONTACTS = 16  # of a world, of tools with each other and with what is fixed

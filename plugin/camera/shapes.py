@@ -6,6 +6,7 @@ import dataclasses
 
 import mujoco
 import numpy as np
+from palpate.tissue.geometry.mesh import vertex_normals
 
 _GEOM = mujoco.mjtGeom
 _ROUND = 0.8  # a mesh is drawn with an edge where normals meet at a smaller cosine than this
@@ -99,15 +100,10 @@ def mesh(model: mujoco.MjModel, k: int) -> Triangles:
 
 def smooth(vert: np.ndarray, face: np.ndarray, texcoord: np.ndarray | None) -> Triangles:
   """Returns a surface with the normals of its vertices; texture coordinates (nvert, 2)."""
-  area = np.cross(vert[face[:, 1]] - vert[face[:, 0]], vert[face[:, 2]] - vert[face[:, 0]])
-  normal = np.zeros_like(vert)
-  for k in range(3):
-    np.add.at(normal, face[:, k], area)
-  normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
   coord = np.zeros((*face.shape, 3))
   if texcoord is not None:
     coord[..., :2] = texcoord[face]
-  return Triangles(vert, face, normal[face], coord)
+  return Triangles(vert, face, vertex_normals(vert, face)[face], coord)
 
 
 def _rows(values: np.ndarray, adr: np.ndarray, num: np.ndarray, k: int) -> np.ndarray:

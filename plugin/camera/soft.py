@@ -19,7 +19,7 @@ from palpate.engine.model.skin import Skin
 from palpate.tissue.geometry import subdivide
 from palpate.tissue.geometry.mesh import Mesh, vertex_normals
 from palpate.tissue.types import fill
-from scipy.sparse import csr_array, eye_array, hstack
+from scipy.sparse import csr_array, eye_array
 
 from .host import Seen
 from .scene import SEEN, Scene, repeat, skin
@@ -103,7 +103,9 @@ class Surface:
     """Adds the organ's skin, or the same with fewer triangles."""
     coarse, level = made.smooth.elem, 0
     while int(coarse.max()) + 1 > self._mesh.nouter:
-      coarse, level = _coarser(coarse), level + 1
+      # `subdivide` has divided each triangle in four.
+      coarse = np.stack([coarse[0::4, 0], coarse[1::4, 1], coarse[2::4, 2]], axis=1)
+      level += 1
     fine, k = subdivide.smooth(coarse, min(level, detail)), made.index
     thing = scene.thing(_OBJ.mjOBJ_SKIN, k, int(model.skin_matid[k]))
     base, above = fine(self._rest[: self._mesh.nouter]), made.height[: fine.count]
@@ -111,7 +113,7 @@ class Surface:
       base = base + above[:, None] * vertex_normals(base, fine.elem)
     texcoord = skin(model, k)[2]
     coord = np.zeros((*fine.elem.shape, 2)) if texcoord is None else texcoord[fine.elem]
-    self._sheets.append(Sheet(base, _weights(fine), coord, 0.0, thing))
+    self._sheets.append(Sheet(base, fine.weights(_FAINT), coord, 0.0, thing))
     self._skin = fine.elem
 
   def _add_flex(self, model: mujoco.MjModel, scene: Scene):
@@ -259,23 +261,3 @@ def _write(out: wp.array, row: int, start: int, values: np.ndarray):
   """Writes values to a row of an array, from a place on."""
   source = wp.array(np.ascontiguousarray(values), dtype=out.dtype, device=out.device)
   wp.copy(out, source, row * (out.size // out.shape[0]) + start * values[0].size, 0, values.size)
-
-
-def _coarser(elem: np.ndarray) -> np.ndarray:
-  """Returns the triangles that `subdivide` has divided in four."""
-  return np.stack([elem[0::4, 0], elem[1::4, 1], elem[2::4, 2]], axis=1)
-
-
-def _weights(fine: subdivide.Smooth) -> csr_array:
-  """Returns the weights of the coarse vertices in the fine ones, without those that are faint."""
-  n = len(fine.control.perm_c)
-  columns = []
-  for start in range(0, n, 256):
-    some = np.zeros((n, min(256, n - start)))
-    np.fill_diagonal(some[start:], 1.0)
-    dense = np.asarray(fine.weight @ fine.control.solve(some))
-    dense[np.abs(dense) < _FAINT] = 0.0
-    columns.append(csr_array(dense))
-  found = csr_array(hstack(columns))
-  found.data /= np.repeat(np.asarray(found.sum(axis=1)), np.diff(found.indptr))
-  return found

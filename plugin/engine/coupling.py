@@ -20,7 +20,7 @@ import warp as wp
 from palpate.tissue import types
 from palpate.tissue.body import Body
 from palpate.tissue.kernels import Kernel, kernel
-from palpate.tissue.types import DIMS, Array, floats, scalar, struct, vector
+from palpate.tissue.types import DIMS, Array, floats, lent, scalar, struct, vector
 
 from . import layout
 from .layout import NodalState, WindowState
@@ -136,14 +136,8 @@ def memory(*names: str) -> Callable[[type], Any]:
   What type and shape that has MuJoCo says itself, see `mjstruct.declared`.
   """
   kinds = {ctypes.c_double: wp.float64, ctypes.c_int: wp.int32}
-
-  def made(cls: type) -> Any:
-    known = {name: mjstruct.declared(name) for name in names}
-    arrays = {name: Array(kinds[kind], shape) for name, (kind, shape) in known.items()}
-    cls.__annotations__ = cls.__annotations__ | arrays
-    return struct(cls)
-
-  return made
+  known = {name: mjstruct.declared(name) for name in names}
+  return lent({name: Array(kinds[kind], shape) for name, (kind, shape) in known.items()})
 
 
 @memory(

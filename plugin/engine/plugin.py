@@ -18,6 +18,7 @@ from palpate.tissue.config import KEYS
 
 from ..forces.passive import Force
 from . import change, contacts, coupling, rods, signals, workspace
+from .bind import bind
 from .cutting import cuts
 from .layout import FLAG
 from .model import declare, mjstruct, skin, state_size
@@ -130,7 +131,7 @@ def _init(model: int, data: int, instance: int) -> int:
     if isinstance(w, Workspace):
       mine = [each for (of, _), each in _workspaces.items() if of == data]
       for each in workspace.join([each for each in mine if isinstance(each, Workspace)]):
-        workspace.rebind(each)
+        bind(each, each.model)
     return 0
   except BaseException as error:
     _say(error)

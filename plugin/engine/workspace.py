@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -217,11 +216,6 @@ class Workspace:
     """What it rests on."""
     return self.forces.of(Supports)
 
-  @property
-  def boxes(self) -> Mapping[str, Any]:
-    """Blocks of the plugin state and of what crosses in a step, see `layout`; windows."""
-    return self.graphs.phases.boxes
-
   def share(self, values: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
     """Returns what cuts have made of values by mass of vertices, some or all, (n,)."""
     return self.cuts.share(values, vert) if self.cuts else values[vert]
@@ -373,7 +367,7 @@ class Workspace:
   def _answer(self):
     """Ends the step with the organ's own response to the change of the contact forces."""
     if self.turn is not None:
-      self.boxes["inbox"].head.numpy()[HEAD.answered] = 1.0
+      self.graphs.phases.boxes["inbox"].head.numpy()[HEAD.answered] = 1.0
     graphs.launch_all(self.graphs.respond)
     if self.graphs.resident:
       self.report.flags[FLAG.pending] = 0
@@ -440,11 +434,6 @@ def set_motion(w: Workspace, model: int, u: np.ndarray | None, v: np.ndarray | N
     place(w, model)
 
 
-def rebind(w: Workspace):
-  """Records the graphs of a workspace anew."""
-  bind(w, w.model)
-
-
 def attach(w: Workspace, model: int):
   """Makes a workspace fit a living model, which need not be the one that it last ran with."""
   if not w.seen.identity.is_of(model):
@@ -462,7 +451,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     w = Workspace(host, Seen(instance), Report(host.flags().numpy().data))
     if organ.windows:
       w.turn = Turn()
-    _view(w, mjstruct.Data.from_address(data), m)
+    _view(w, mjstruct.Data.from_address(data))
     prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
     mass = np.where(body.shape.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
@@ -481,7 +470,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     return w
 
 
-def _view(w: Workspace, d: mjstruct.Struct, m: mjstruct.Struct):
+def _view(w: Workspace, d: mjstruct.Struct):
   """Takes views of an mjData that every step looks at."""
   fields = mjstruct.Data
   w.seen.status = w.host.arrays["status"].numpy()[0].data

@@ -108,7 +108,9 @@ def to_organ(
     raise ValueError(f"organ {name!r}: bonds name itself, expected a body or another organ")
   vert = _free(host) if near else check_vertices(host, vertices)
   theirs = there.places(np.arange(mesh.nouter), now)
-  elem, weight, far = _on_triangles(host.places(vert, now), theirs[mesh.elem])
+  corner, no_geoms = theirs[mesh.elem], np.zeros((0, len(GEOM)))
+  found = _search(_measure_triangles, host.places(vert, now), no_geoms, corner)
+  elem, weight, far = found.elem.numpy(), found.weight.numpy(), found.far.numpy()
   if near:
     vert, elem, weight = (each[far <= near] for each in (vert, elem, weight))
   area = _areas(host, vert, name, near)
@@ -144,10 +146,7 @@ def _areas(host: Host, vert: np.ndarray, name: str, near: float) -> np.ndarray:
 def _normals(host: Host, now: bool) -> np.ndarray:
   """Returns the unit normals of an organ's vertices in the world, (nouter, 3)."""
   mesh = host.organ.mesh
-  x = host.places(np.arange(mesh.nouter), now)
-  out = np.zeros((mesh.nouter, 3))
-  np.add.at(out, mesh.elem, topology.area_vectors(x, mesh.elem)[:, None])
-  return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
+  return topology.vertex_normals(host.places(np.arange(mesh.nouter), now), mesh.elem)
 
 
 def _far_from_geoms(m: mjstruct.Struct, body: int, points: np.ndarray) -> np.ndarray:
@@ -176,12 +175,6 @@ def _up(m: mjstruct.Struct, body: int, points: np.ndarray, step: float) -> np.nd
   far = _far_from_geoms(m, body, moved.reshape(-1, 3)).reshape(-1, 3, 2)
   out = far[..., 0] - far[..., 1]
   return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
-
-
-def _on_triangles(points: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, ...]:
-  """Returns the triangle nearest to each point, the weights of its corners, and the distance."""
-  found = _search(_measure_triangles, points, np.zeros((0, len(GEOM))), corner)
-  return found.elem.numpy(), found.weight.numpy(), found.far.numpy()
 
 
 def _search(kernel: Kernel, points: np.ndarray, geom: np.ndarray, corner: np.ndarray):

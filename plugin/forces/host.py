@@ -1,8 +1,9 @@
 """What a passive force knows of its organ: a host, with the organ in one world or in many.
 
 The plugin's host has one world, in MuJoCo's own memory (`palpate.engine.host`); that of a batch has
-rows of worlds, in mujoco_warp's (`palpate.batch.host`). A force is written once, over structs whose
-arrays have worlds in front: a kernel begins by moving what worlds have of their own to its world.
+rows of worlds, in mujoco_warp's (`palpate.batch.organ.host`). A force is written once, over structs
+whose arrays have worlds in front: a kernel begins by moving what worlds have of their own to its
+world.
 """
 
 # pyright: reportInvalidTypeForm=false

@@ -167,10 +167,6 @@ class Forces:
   def __bool__(self) -> bool:
     return any(self._each)
 
-  def add(self, force: Any):
-    """Adds what acts after the others."""
-    self._each.append(force)
-
   def of(self, kind: type[Kind]) -> Kind:
     """Returns the force of a kind."""
     (found,) = (each for each in self._each if type(each) is kind)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -13,10 +11,9 @@ from .geometry.mesh import Mesh
 LANES = 8  # nodes of a slice; see core/simd.h
 
 
-def pad(array: np.ndarray, fill=0, least: int = 0) -> np.ndarray:
-  """Returns `array` with its first axis padded to whole slices, by `least` rows or more."""
-  count = least + -(len(array) + least) % LANES
-  extra = np.full((count, *array.shape[1:]), fill, array.dtype)
+def pad(array: np.ndarray, fill=0) -> np.ndarray:
+  """Returns `array` with its first axis padded to whole slices."""
+  extra = np.full((-len(array) % LANES, *array.shape[1:]), fill, array.dtype)
   return np.concatenate([array, extra])
 
 
@@ -38,11 +35,7 @@ def offset(index: np.ndarray, size: int = 3) -> np.ndarray:
 
 
 def ellpack(
-  row: np.ndarray,
-  index: np.ndarray,
-  value: np.ndarray,
-  fill: np.ndarray,
-  room: Callable[[np.ndarray], np.ndarray] | None = None,
+  row: np.ndarray, index: np.ndarray, value: np.ndarray, fill: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   """Returns the lists of all nodes as sliced ELLPACK: row k of a slice has their k-th entries.
 
@@ -51,7 +44,6 @@ def ellpack(
     index: what it points at    (n,)
     value: its value            (n,)
     fill: what the entries that pad a node's list point at, with value 0 (nslice, 8)
-    room: returns the rows of each slice from the numbers of entries, None for as few as may be
 
   Returns:
     rows of each slice (nslice,), entries and values (rows, 8)
@@ -59,7 +51,7 @@ def ellpack(
   by_row = np.lexsort((index, row))
   row, index, value = row[by_row], index[by_row], value[by_row]
   count = np.bincount(row, minlength=fill.size)
-  width = count.reshape(-1, LANES).max(axis=1) if room is None else room(count)
+  width = count.reshape(-1, LANES).max(axis=1)
   within = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
   place = (np.cumsum(width) - width)[row // LANES] + within
   entry = np.repeat(fill, width, axis=0)

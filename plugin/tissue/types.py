@@ -75,6 +75,16 @@ def struct(cls) -> Any:
   return wp.struct(cls)
 
 
+def lent(arrays: dict[str, Array]) -> Callable[[type], Any]:
+  """Returns a decorator: a struct has arrays of another library's as well, under these names."""
+
+  def made(cls: type) -> Any:
+    cls.__annotations__ = cls.__annotations__ | arrays
+    return struct(cls)
+
+  return made
+
+
 def also(kind: Any, *names: str) -> Callable[[type], type]:
   """Returns a decorator: a struct that is to be has some fields of another one as well."""
   dims = DIMS[kind.key]

@@ -141,12 +141,7 @@ class Common:
 RUNNING, SUCCESS, DAMAGED, MISSED = (wp.constant(k) for k in range(len(OUTCOMES)))
 # Common by the names of the observations and of Gymnasium's information, where those differ.
 OBSERVED = {"drive": "drive_error"}
-INFO = {
-  name: name
-  for name in ("success", "outcome", "progress", "peak_force", "cost", "cost_force", "cost_shaft")
-} | {
-  "cost_surroundings": "cost_surroundings",
-  "cost_damage": "cost_damage",
-  "shaft_force": "shaft_peak",
-  "surroundings_force": "around_peak",
-}
+INFO = {name: name for name in (
+  "success", "outcome", "progress", "peak_force", "cost", "cost_force", "cost_shaft",
+  "cost_surroundings", "cost_damage",
+)} | {"shaft_force": "shaft_peak", "surroundings_force": "around_peak"}  # fmt: skip

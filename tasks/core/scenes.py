@@ -278,17 +278,10 @@ def _look(spec: mujoco.MjSpec, scene: Scene, center: np.ndarray) -> None:
   """Puts the camera on a laparoscope, whose picture is level where its joints are zero."""
   prefix = f"{laparoscope.NAME}/"
   back = np.asarray(scene.port) / np.linalg.norm(scene.port)
-  quat = trocar.orientation(np.column_stack([*_upright(back), back]))
+  quat = trocar.orientation(laparoscope.upright(back))
   trocar.attach(spec, laparoscope.NAME, prefix, center + scene.port, quat, scene.handle)
   spec.body(f"{prefix}eye").quat = laparoscope.turned(scene.optics)
   spec.camera(f"{prefix}camera").name = CAMERA
-
-
-def _upright(back: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-  """Returns right and up of a level picture from its direction back to the camera."""
-  right = np.cross([0.0, 0.0, 1.0], back)
-  right /= np.linalg.norm(right)
-  return right, np.cross(back, right)
 
 
 def _xml(flex: str, center: np.ndarray, scene: Scene, bed: str) -> str:
@@ -297,7 +290,7 @@ def _xml(flex: str, center: np.ndarray, scene: Scene, bed: str) -> str:
 
   camera = center + scene.camera
   back = np.asarray(scene.camera) / np.linalg.norm(scene.camera)
-  axes = numbers(np.concatenate(_upright(back)))
+  axes = numbers(laparoscope.upright(back).T[:2].ravel())
   fixed = scene.instrument != laparoscope.NAME
   lens = f'<camera name="{CAMERA}" pos="{numbers(camera)}" fovy="50" xyaxes="{axes}"/>' * fixed
   sites = "".join(

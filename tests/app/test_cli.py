@@ -38,6 +38,12 @@ def test_help_lists_commands_and_needs_neither_mujoco_nor_warp():
   assert not re.search(r"\| +(mujoco|warp)\b", done.stderr)
 
 
+def test_its_module_runs_as_the_command_does():
+  words = [sys.executable, "-m", "palpate.app.cli", "evaluate", "touch/none"]
+  done = subprocess.run(words, capture_output=True, text=True, timeout=300)
+  assert done.returncode == 2 and "touch/none" in done.stderr
+
+
 def test_every_command_has_help(capsys):
   for words in cli.COMMANDS:
     with pytest.raises(SystemExit) as end:

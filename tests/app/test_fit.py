@@ -281,9 +281,8 @@ def test_an_option_that_is_wrong_is_named(tmp_path, capsys, words, match):
 def test_ctrl_c_keeps_the_best_so_far(tmp_path, record):
   data, out = written(tmp_path / "data.csv", record), tmp_path / "out"
   slow = [*WORDS[:-1], "0.00002"]  # for minutes
-  code = "import sys; from palpate.app import cli; sys.exit(cli.main(sys.argv[1:]))"
   with subprocess.Popen(
-    [sys.executable, "-c", code, "fit", data, *slow, "--out", str(out)],
+    [sys.executable, "-m", "palpate", "fit", data, *slow, "--out", str(out)],
     stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ,
   ) as process:  # fmt: skip
     time.sleep(5)

@@ -2,7 +2,7 @@
 
 # pyright: reportIndexIssue=false
 import warp as wp
-from palpate.batch.compiling import compile_ahead
+from palpate.batch.mjw.compiling import compile_ahead
 
 
 @wp.kernel(enable_backward=False)

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 from devices import needs_cuda
 from palpate.batch.contact.fixed_order import FixedOrder, is_enough, sort_matches
-from palpate.batch.private import ConstraintState, solver
+from palpate.batch.mjw.private import ConstraintState, solver
 from scenes import probed
 
 ROWS = ("type", "id", "J_rownnz", "J_rowadr", "pos", "margin", "D", "vel", "aref", "frictionloss")

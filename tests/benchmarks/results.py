@@ -193,9 +193,9 @@ def page(
 ) -> pathlib.Path:
   """Writes a page and returns its path.
 
-  A page begins with its title, its finding and its plot. What it was measured with, the command and
-  the lines follow. What an existing page has from `## Remarks` on was written by hand and stays.
-  `older` in the notes, written by hand until the next run, says what the rows are older than.
+  A page begins with its title, its finding and its plot. What its rows are older than (`older` in
+  the notes, written by hand until the next run), what it was measured with, the command and the
+  lines follow. What an existing page has from `## Remarks` on was written by hand and stays.
 
   Args:
     path: the page
@@ -210,8 +210,8 @@ def page(
   head = [f"- {line}" for line in finding or ["Too few rows for a finding."]]
   if about.get("done", 0) < about.get("cases", 0):
     head += ["", f"The run is incomplete: {about['done']} of {about['cases']} cases."]
-  head += ["", f"**Older.** {about['older']}"] if about.get("older") else []
   head += ["", f"![{title}]({plot.name})"] if plot else []
+  head += ["", f"**Older.** {about['older']}"] if about.get("older") else []
   command = f"    palpate bench {about.get('bench', path.stem)}"
   command += " --short" if about.get("short") else ""
   options = about.get("options", {})

@@ -89,7 +89,7 @@ def test_an_organ_and_what_it_strikes_keep_their_momentum(scenes):
   organ.set_state(xvel=np.tile([0, 0, -0.5], (organ.nvert, 1)))
   _run(model, data, 0.2)
   space = scenes.workspace(organ)
-  v = space.boxes["own"].motion.vel.numpy()  # with the inside
+  v = space.graphs.phases.boxes["own"].motion.vel.numpy()  # with the inside
   momentum = space.organ.windows.mass @ v[:, 2] + 0.5 * data.qvel[model.joint("s").dofadr[0]]
   assert data.qvel[model.joint("s").dofadr[0]] < -0.1
   assert momentum == pytest.approx(-0.5 * MASS, rel=0.01)

@@ -28,12 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--camera", metavar="NAME", help="camera of the scene, or free (laparoscope, else the first)")
   add("--size", metavar="WxH", default="1280x960", help="pixels (%(default)s)")
   add(
-    "--seconds",
-    metavar="S",
-    type=float,
+    "--seconds", metavar="S", type=float,
     help="simulated time: a picture shows its end, a film all of it (0, 2); in an exercise its "
     "expert acts, until the episode ends at most",
-  )
+  )  # fmt: skip
   add("--fps", metavar="N", type=int, default=25, help="frames a second of a film (%(default)s)")
   add("--slower", metavar="X", type=float, default=1.0, help="slow motion (%(default)s)")
   add("--edges", action="store_true", help="draw the organ's edges over its surface")

@@ -20,28 +20,23 @@ def add_arguments(parser: argparse.ArgumentParser):
   from palpate import models
 
   parser.add_argument(
-    "scene",
-    metavar="SCENE",
+    "scene", metavar="SCENE",
     help=f"{', '.join(models.NAMES)}, abdomen or press; an exercise such as touch/easy; an MJCF "
     "file; a folder with a scene.xml",
-  )
+  )  # fmt: skip
   parser.add_argument(
-    "--nodes",
-    metavar="N",
-    type=int,
+    "--nodes", metavar="N", type=int,
     help=f"resolution of a named organ, {' or '.join(map(str, models.RESOLUTIONS))}",
-  )
+  )  # fmt: skip
   parser.add_argument("--seed", metavar="N", type=int, help="variant of a named organ's shape")
   parser.add_argument(
-    "--instruments",
-    metavar="NAMES",
+    "--instruments", metavar="NAMES",
     help=f"of a named organ, separated by commas ({','.join(models.INSTRUMENTS)})",
-  )
+  )  # fmt: skip
   parser.add_argument(
-    "--coupling",
-    choices=("nodal", "window"),
+    "--coupling", choices=("nodal", "window"),
     help="of a named organ; window: MuJoCo has only the nodes near the instruments (nodal)",
-  )
+  )  # fmt: skip
   parser.add_argument("--keyframe", metavar="NAME", help="state to start from (the first keyframe)")
 
 

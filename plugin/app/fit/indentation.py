@@ -96,7 +96,9 @@ class Indentation:
     self._test, self._record = test, record
     self.step = test.step or float(np.clip(record.time[-1] / _STEPS, _LEAST, _MOST[test.tip]))
     deepest = test.share * float(record.depth.max())
-    contact = _contact_radius(test, deepest)
+    contact = test.radius  # how wide it gets [m]
+    if test.tip == "sphere":
+      contact = min(contact, math.sqrt(contact * deepest))
     edge, around = test.edge or contact / _EDGES[test.tip], _AROUND * contact
     for _ in range(_TRIES):
       if test.organ:
@@ -205,11 +207,6 @@ def first_guess(test: Test, record: Record, poisson: float) -> float:
   else:
     reduced = 0.5 * force / (test.radius * depth)
   return reduced * (1 - poisson**2)
-
-
-def _contact_radius(test: Test, depth: float) -> float:
-  """Returns how wide the contact gets [m], at most as the tool."""
-  return min(test.radius, math.sqrt(test.radius * depth)) if test.tip == "sphere" else test.radius
 
 
 def _add_tip(tool, test: Test, soft: float, mass: float):

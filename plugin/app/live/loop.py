@@ -43,9 +43,9 @@ def tick(pace: Pace, links: Sequence[Link], tips: Sequence[Sequence[float]]) -> 
   return False
 
 
-def axes(model: mujoco.MjModel, data: mujoco.MjData, camera: str = "laparoscope") -> np.ndarray:
-  """Returns the device's axes in the world, those of a camera's picture, in columns  (3, 3)."""
-  return data.cam_xmat[model.camera(camera).id].reshape(3, 3).copy()
+def axes(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+  """Returns a device's axes in the world, the laparoscope's picture's, in columns  (3, 3)."""
+  return data.cam_xmat[model.camera("laparoscope").id].reshape(3, 3).copy()
 
 
 class Loop:
@@ -63,7 +63,6 @@ class Loop:
     hands: Mapping[str, Device],
     options: Options | None = None,
     pace: Pace | None = None,
-    camera: str = "laparoscope",
   ):
     """Couples the hands, their instruments where they are.
 
@@ -73,9 +72,8 @@ class Loop:
       hands: device of each instrument, by its prefix, such as "probe/"
       options: of the coupling
       pace: 1 kHz, or the model's own time step, by default
-      camera: that the devices' axes are of
     """
-    self._model, self._data, self._camera = model, data, camera
+    self._model, self._data = model, data
     self.pace = pace or Pace(model.opt.timestep)
     mujoco.mj_forward(model, data)
     self.links = [Link(device, options, model.opt.timestep) for device in hands.values()]
@@ -90,7 +88,7 @@ class Loop:
 
   def attach(self) -> None:
     """Couples the hands to their instruments where these are: nothing moves by this."""
-    turn = axes(self._model, self._data, self._camera)
+    turn = axes(self._model, self._data)
     for i, link in enumerate(self.links):
       tip, shaft = self._tips[i].tolist(), self._shafts[i]
       link.attach(shaft, tip, shaft.quat(tip), turn)
@@ -120,8 +118,9 @@ class Loop:
             row, before, self._rows[i] = link.row, self._rows[i], link.row
             vel = (row[0] - before[0]) / h, (row[1] - before[1]) / h, (row[2] - before[2]) / h
             handle.move(row[:3], row[3:], vel, spin(before[3:], row[3:], h))
-          if self._jaws:
-            self._close_jaws()
+          for link, jaw in self._jaws:
+            low, high = model.actuator_ctrlrange[jaw]
+            data.ctrl[jaw] = low + (high - low) * (link.jaw + 1) / 2
           mujoco.mj_step(model, data)
           for _, (link, handle) in hands:
             link.feel(handle.wrench())
@@ -131,9 +130,3 @@ class Loop:
     finally:
       for link in self.links:
         link.quiet()
-
-  def _close_jaws(self) -> None:
-    """Opens and closes those that have some, as the hands do."""
-    for link, jaw in self._jaws:
-      low, high = self._model.actuator_ctrlrange[jaw]
-      self._data.ctrl[jaw] = low + (high - low) * (link.jaw + 1) / 2

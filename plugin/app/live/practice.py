@@ -274,9 +274,9 @@ def own(path: pathlib.Path, instruments: Sequence[str]) -> tuple[mj.MjSpec, str]
     spec.delete(key)
   eye = middle + size * np.array(_EYE)
   if mj.mj_name2id(model, mj.mjtObj.mjOBJ_CAMERA, "laparoscope") < 0:
-    right = np.cross(middle - eye, [0.0, 0.0, 1.0])
-    up = np.cross(right, middle - eye)
-    spec.worldbody.add_camera(name="laparoscope", pos=eye, fovy=50.0, quat=_turn(right, up))
+    turn = laparoscope.upright((eye - middle) / np.linalg.norm(eye - middle))
+    quat = trocar.orientation(turn)
+    spec.worldbody.add_camera(name="laparoscope", pos=eye, fovy=50.0, quat=quat)
   else:
     eye = data.cam_xpos[model.camera("laparoscope").id]
   toward = (eye - middle) / np.linalg.norm(eye - middle)
@@ -287,9 +287,3 @@ def own(path: pathlib.Path, instruments: Sequence[str]) -> tuple[mj.MjSpec, str]
     port = middle + reach * toward + side * _APART * size * aside
     trocar.attach(spec, instrument, f"{instrument}/", port, trocar.aim(port, middle), handle=True)
   return spec, names[0]
-
-
-def _turn(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-  """Returns the orientation whose first axes go these ways, w x y z."""
-  x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
-  return trocar.orientation(np.stack([x, y, np.cross(x, y)], axis=1))

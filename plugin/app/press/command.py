@@ -46,33 +46,23 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--nodes", metavar="N", type=int, help="remake the shipped organ with this number of nodes")
   add("--seed", metavar="N", type=int, help="remake the shipped organ with other lobes")
   add(
-    "--coupling",
-    choices=("nodal", "window"),
+    "--coupling", choices=("nodal", "window"),
     help="window: MuJoCo has only the nodes near the probe (the scene's)",
-  )
+  )  # fmt: skip
   add("--device", metavar="DEVICE", help="cpu, cuda:0 or auto (the scene's)")
   add(
-    "--set",
-    metavar="KEY=VALUE",
-    action="append",
-    default=[],
+    "--set", metavar="KEY=VALUE", action="append", default=[],
     help="an organ's configuration key, as young=8000; may be repeated",
-  )
+  )  # fmt: skip
   add("--out", metavar="FOLDER", default="out", help="output folder (%(default)s)")
   add(
-    "--video",
-    metavar="FILE",
-    nargs="?",
-    const="",
+    "--video", metavar="FILE", nargs="?", const="",
     help=f"film it, {_SLOWER} times slower: .mp4 or .gif (press.mp4 in the output folder)",
-  )
+  )  # fmt: skip
   add(
-    "--picture",
-    metavar="FILE",
-    nargs="?",
-    const="",
+    "--picture", metavar="FILE", nargs="?", const="",
     help="draw the scene at its deepest: .png (press_deepest.png in the output folder)",
-  )
+  )  # fmt: skip
 
 
 def main(args: argparse.Namespace) -> int:
@@ -228,7 +218,7 @@ def _compile(path: pathlib.Path, args: argparse.Namespace):
   import mujoco
   from palpate import windows as author
   from palpate.engine.model.mjstruct import NAME
-  from palpate.organ import Organ
+  from palpate.organ import Organ, instances
   from palpate.tissue import config
 
   changes = {}
@@ -253,12 +243,7 @@ def _compile(path: pathlib.Path, args: argparse.Namespace):
     raise CommandError(f"scene {path.name}: {compile_error(error)}") from None
   if model.nkey:
     mujoco.mj_resetDataKeyframe(model, data, 0)
-  names = []
-  for flex in range(model.nflex):
-    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, flex) or ""
-    with contextlib.suppress(ValueError):
-      names.append(Organ(model, data, name).name)
-  if not names:
+  if not (names := list(instances(model))):
     raise CommandError(f"no organ in {path.name}, expected a flexcomp with plugin {NAME!r}")
   try:
     return model, data, Organ(model, data, args.organ or names[0])

@@ -19,12 +19,12 @@ from palpate.engine.model import mjstruct
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, also, doubles, floats, ints
 
-from ..patch import Patch, launch
-from ..private import contact_kbimp, vec5
-from ..warp_arrays import arrays_of, theirs
+from ..mjw.arrays import arrays_of, theirs
+from ..mjw.private import contact_kbimp, vec5
+from ..organ.patch import Patch, launch
 
 if TYPE_CHECKING:
-  from ..organs import Organ
+  from ..organ.organ import Organ
 
 _ASKED, _SHARE, _FIRM = (wp.constant(k) for k in (TISSUE.asked, TISSUE.share, TISSUE.firm))
 # Tools under which contacts yield by what the mesh cannot, see contact/series_compliance.h.

@@ -19,16 +19,16 @@ from palpate.engine import contacts
 from palpate.engine.model import mjstruct
 from palpate.tissue.types import Array, fill, floats, ints
 
-from .. import private
 from ..kernels import triple
-from ..patch import Patch, halves
-from ..private import ContactType, vec5
-from ..warp_arrays import arrays_of, theirs
+from ..mjw import private
+from ..mjw.arrays import arrays_of, theirs
+from ..mjw.private import ContactType, vec5
+from ..organ.patch import Patch, halves
 from . import convex, cylinder, triangle
 from .convex import Convex
 
 if TYPE_CHECKING:
-  from ..organs import Organ
+  from ..organ.organ import Organ
 
 _GEOM = mujoco.mjtGeom
 # Contacts of a triangle with a tool, at most, as mujoco_warp finds them.

@@ -9,8 +9,8 @@ import warp as wp
 # All that depends on names inside of mujoco_warp, with those of `contacts`.
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
-from ..patch import halves
-from ..private import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, Geom, GeomType, ccd
+from ..mjw.private import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, Geom, GeomType, ccd
+from ..organ.patch import halves
 
 KINDS = {int(mujoco.mjtGeom.mjGEOM_MESH)}
 _ROUNDS = wp.constant(16)  # of GJK and of EPA, at most

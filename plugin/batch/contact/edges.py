@@ -6,7 +6,7 @@ import warp as wp
 from palpate.engine.layout import GEOM
 from palpate.tissue.types import doubles, struct
 
-from ..patch import Patch
+from ..organ.patch import Patch
 
 _POS, _AXIS = wp.constant(GEOM.pos), wp.constant(GEOM.axis)
 

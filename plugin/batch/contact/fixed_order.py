@@ -23,9 +23,9 @@ import warp as wp
 from palpate.tissue.kernels import meet_block
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
-from .. import private
-from ..private import ConstraintState, ConstraintType
-from ..warp_arrays import arrays_of, theirs
+from ..mjw import private
+from ..mjw.arrays import arrays_of, theirs
+from ..mjw.private import ConstraintState, ConstraintType
 
 # Columns of mujoco_warp's rows that move with them.
 _COLUMNS = ("type", "id", "J_rownnz", "J_rowadr", "pos", "margin", "D", "vel", "aref",

@@ -16,8 +16,8 @@ from typing import Any
 import warp as wp
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
-from .. import private
-from ..private import ConstraintState
+from ..mjw import private
+from ..mjw.private import ConstraintState
 
 _BLOCK = 32  # threads of a world
 _SATISFIED = wp.constant(int(ConstraintState.SATISFIED))

@@ -4,7 +4,7 @@
 # pyright: reportInvalidTypeForm=false
 import warp as wp
 
-from .. import private
+from ..mjw import private
 
 _FAR = wp.constant(1e10)  # what mujoco_warp says of a contact that is none
 

@@ -25,11 +25,12 @@ from palpate.tissue.geometry.mesh import Mesh, distinct
 from palpate.tissue.order import LANES, offset
 from palpate.tissue.types import NUMBERS, fill
 
-from .. import host, kernels
-from ..patch import Surface
+from .. import kernels
+from ..organ import host
+from ..organ.patch import Surface
 
 if TYPE_CHECKING:
-  from ..organs import Organ
+  from ..organ.organ import Organ
 
 _OWN = ("rest", "elem", "tet", "touch", "source", "share", "held")  # fields of `Patch`
 _INSIDE = NUMBERS.index("bulk")  # and pressure after it

@@ -76,7 +76,8 @@ def _by_itself(
   """Returns the effective inertia of the nodes `sample` [kg], each pushed alone."""
   h, mass = float(m.opt.timestep), masses(m, organ)
   numbers = [h, config.damping, config.foundation, config.bulk]
-  key = _digest(np.concatenate([numbers, mass, organ.mesh.rest.ravel(), organ.free]))
+  known = np.concatenate([numbers, mass, organ.mesh.rest.ravel(), organ.free])
+  key = hashlib.sha256(known.tobytes()).digest()
   key += repr((organ.config, config.integrator, material(config))).encode()
   if key not in _alone:
     if len(_alone) >= _KNOWN:
@@ -148,10 +149,6 @@ def _scratch(body: Body, config: Config) -> Body:
   shape.renumber(out, dataclasses.replace(config, tolerance=1e-2, newton=1))
   out.state.mass.assign(np.where(out.shape.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8))
   return out
-
-
-def _digest(values: np.ndarray) -> bytes:
-  return hashlib.sha256(np.ascontiguousarray(values).tobytes()).digest()
 
 
 def _tool_radius(m: mjstruct.Struct, organ: Declaration, flex: int) -> float:

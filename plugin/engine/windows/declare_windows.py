@@ -241,7 +241,7 @@ def _check_neighbours(
   contype = mjstruct.view(m.flex_contype, m.nflex, np.int32)
   conaffinity = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)
   surface = _surfaces(model, m, instance, without=instance)
-  bearing = _bearing(model, m, instance, name)
+  bearing = _bearing(model, m, name)
   points = origin + rest @ frame.T
   room = _NEAR * float(np.linalg.norm(np.ptp(points, axis=0)))
   low, high = points.min(axis=0) - room, points.max(axis=0) + room
@@ -261,7 +261,7 @@ def _check_neighbours(
       )
 
 
-def _bearing(model: int, m: mjstruct.Struct, instance: int, name: str) -> set[str]:
+def _bearing(model: int, m: mjstruct.Struct, name: str) -> set[str]:
   """Returns the organs on which one rests, and those that rest on it."""
   names = flexes.names(m)
   found = {}

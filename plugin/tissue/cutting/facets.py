@@ -67,12 +67,13 @@ class Edges:
     room: triangles that there may be
 
   Attributes:
+    CELL: what a mesh has between them
     OF_SHAPE, OF_TISSUE: arrays of `Shape` and `Tissue` that a cut changes
     READ: arrays that are needed to write them
     finder: of places on the surface
   """
 
-  OF_SHAPE, OF_TISSUE, READ = rows.OF_SHAPE, rows.OF_TISSUE, rows.ADDRESSES
+  CELL, OF_SHAPE, OF_TISSUE, READ = "elem", rows.OF_SHAPE, rows.OF_TISSUE, rows.ADDRESSES
 
   def __init__(self, whole: Mesh, room: int):
     self.whole, self._room, self._copy = whole, room, WorkingCopy(whole)
@@ -101,7 +102,7 @@ class Edges:
 
   def touched(self, old: Mesh, new: Mesh, changed: np.ndarray) -> np.ndarray:
     """Returns the vertices that something has changed at, in one mesh and another."""
-    return topology.touched(old, new, changed)
+    return topology.distinct(*(getattr(mesh, self.CELL)[changed] for mesh in (old, new)))
 
   def aim(self, arrays: Mapping[str, Any], node: np.ndarray, nnode: int, half: Any = None):
     """Writes into other arrays from now on.
@@ -182,7 +183,7 @@ class Edges:
 class Faces(Edges):
   """Faces between the tetrahedra of a solid: what of these is not as of edges."""
 
-  OF_SHAPE, OF_TISSUE, READ = tets.OF_SHAPE, tets.OF_TISSUE, tets.ADDRESSES
+  CELL, OF_SHAPE, OF_TISSUE, READ = "tet", tets.OF_SHAPE, tets.OF_TISSUE, tets.ADDRESSES
 
   def _make_knife(self) -> Any:
     return Cleaver(self.whole, self.finder, self._room)
@@ -202,10 +203,6 @@ class Faces(Edges):
     new = found.member >= first
     seat[found.member[new] - first] = found.seat[new]
     return seat
-
-  def touched(self, old: Mesh, new: Mesh, changed: np.ndarray) -> np.ndarray:
-    """See `Edges`."""
-    return topology.distinct(old.tet[changed], new.tet[changed])
 
   def aim(self, arrays: Mapping[str, Any], node: np.ndarray, nnode: int, half: Any = None):
     """See `Edges`."""

@@ -369,11 +369,7 @@ def _rings(organ, elem, twin, nvert, only: tuple[np.ndarray, np.ndarray] | None 
 
 
 def recut(
-  mesh: Mesh,
-  rest: np.ndarray,
-  elem: np.ndarray,
-  loose: np.ndarray | None = None,
-  near: np.ndarray | None = None,
+  mesh: Mesh, rest: np.ndarray, elem: np.ndarray, loose: np.ndarray | None = None
 ) -> tuple[Mesh, np.ndarray]:
   """Returns a mesh with other rest positions and other corners, by cuts of the same whole.
 
@@ -382,27 +378,24 @@ def recut(
     rest: rest positions [m]  (nvert, 3)
     elem: triangles: those of the whole, cut along edges  (nelem, 3)
     loose: see `Mesh`
-    near: triangles around all vertices that have moved or come apart, None for any
 
   Returns:
     the mesh, and the triangles that are not as they were, ascending
   """
   whole = mesh.whole
-  if near is None:
-    near = np.arange(mesh.nelem)
-    if np.array_equal(elem, whole.elem) and np.array_equal(rest, whole.rest):
-      elem, rest = whole.elem, whole.rest
+  if np.array_equal(elem, whole.elem) and np.array_equal(rest, whole.rest):
+    elem, rest = whole.elem, whole.rest
   new = whole
   if elem is not whole.elem:
     new = dataclasses.replace(mesh, rest=rest, elem=elem, uncut=whole, loose=loose)
-    twin = _joined(new, near)
+    twin = _joined(new)
     closed = bool((twin >= 0).all())
     new = dataclasses.replace(new, twin=twin, closed=closed)
-  before, after = mesh.elem[near], new.elem[near]
-  edges = (mesh.twin.reshape(-1, 3)[near] != new.twin.reshape(-1, 3)[near]).any(axis=1)
+  before, after = mesh.elem, new.elem
+  edges = (mesh.twin != new.twin).reshape(-1, 3).any(axis=1)
   cut = (before != after).any(axis=1) | edges
   moved = (mesh.rest[before] != new.rest[before]) | (mesh.rest[after] != new.rest[after])
-  changed = near[cut | moved.any(axis=(1, 2))]
+  changed = np.flatnonzero(cut | moved.any(axis=(1, 2)))
   if new is whole or not changed.size:
     return (new if new is whole else dataclasses.replace(mesh, loose=loose)), changed
   walk = distinct(before[cut], after[cut])
@@ -415,20 +408,9 @@ def recut(
   return dataclasses.replace(new, ring=ring, ring_elem=ring_elem, degree=degree), changed
 
 
-def touched(old: Mesh, new: Mesh, changed: np.ndarray) -> np.ndarray:
-  """Returns the corners that triangles had or have, ascending."""
-  return distinct(old.elem[changed], new.elem[changed])
-
-
-def _joined(mesh: Mesh, near: np.ndarray) -> np.ndarray:
-  """Returns the half-edges on the other side, of triangles of the whole some of which were cut.
-
-  Only those of `near` are not as `mesh.twin` has them.
-  """
-  half = (3 * near[:, None] + np.arange(3)).ravel()
-  other = mesh.whole.twin[half]
+def _joined(mesh: Mesh) -> np.ndarray:
+  """Returns the half-edges on the other side, of triangles of the whole some of which were cut."""
+  half, other = np.arange(len(mesh.whole.twin)), mesh.whole.twin
   joined = (other >= 0) & (corners(mesh, half) == corners(mesh, other, 1))
   joined &= corners(mesh, half, 1) == corners(mesh, other)
-  twin = mesh.twin.copy()
-  twin[half] = np.where(joined, other, -1)
-  return twin
+  return np.where(joined, other, -1)

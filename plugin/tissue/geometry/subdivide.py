@@ -12,10 +12,11 @@ import dataclasses
 import functools
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array, vstack
+from scipy.sparse import csr_array, diags_array, hstack, vstack
 from scipy.sparse.linalg import SuperLU, splu
 
 LEVELS = (1, 2, 3, 4)
+_COLUMNS = 256  # of a dense matrix at a time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +41,21 @@ class Smooth:
   def __call__(self, values: np.ndarray) -> np.ndarray:
     """Returns values at the fine vertices (nfine, k) of those at the coarse ones (ncoarse, k)."""
     return self.weight @ self.control.solve(np.ascontiguousarray(values, dtype=float))
+
+  def weights(self, least: float) -> csr_array:
+    """Returns what coarse vertices weigh in fine ones, without the weights that are below `least`.
+
+    Those of a fine vertex still add up to 1.
+    """
+    n, columns = len(self.control.perm_c), []
+    for start in range(0, n, _COLUMNS):
+      unit = np.eye(n, min(_COLUMNS, n - start), -start)
+      dense = self(unit)
+      dense[np.abs(dense) < least] = 0.0
+      columns.append(csr_array(dense))
+    found = csr_array(hstack(columns))
+    found.data /= np.repeat(np.asarray(found.sum(axis=1)), np.diff(found.indptr))
+    return found
 
 
 def smooth(elem: np.ndarray, levels: int) -> Smooth:

@@ -335,7 +335,7 @@ def test_tool_may_go_half_of_its_distance_from_the_surface(swing, height):
   d.qpos[-2] = d.ctrl[0] = height
   mujoco.mj_step(m, d, nstep=250)
   assert organ.asleep
-  leeway = workspace(organ).boxes["own"].tail.numpy()[TAIL.leeway]
+  leeway = workspace(organ).graphs.phases.boxes["own"].tail.numpy()[TAIL.leeway]
   n = 60
   a, b = np.array([(i / n, j / n) for i in range(n + 1) for j in range(n + 1 - i)]).T[:, :, None]
   x, y, z = organ.xpos[organ.elem].transpose(1, 0, 2)[:, :, None]

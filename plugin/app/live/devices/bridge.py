@@ -28,19 +28,16 @@ class Bridge(Silent):
 
   name = "udp"
   relative = False
+  rate = 500.0
+  force_limit, torque_limit = 3.0, 0.1
 
-  def __init__(
-    self, port: int = 5005, host: str = "127.0.0.1", rate: float = 500.0, force_limit: float = 3.0
-  ):
+  def __init__(self, port: int, host: str):
     """Listens.
 
     Args:
       port: UDP port, 0 for any that is free
       host: address of this machine; others reach it only by one that is not 127.0.0.1
-      rate: packets a second
-      force_limit: largest force that the device can give [N]
     """
-    self.rate, self.force_limit, self.torque_limit = rate, force_limit, 0.1
     self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     self._socket.setblocking(False)
     try:

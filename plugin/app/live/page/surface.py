@@ -13,10 +13,9 @@ import mujoco as mj
 import numpy as np
 from palpate import Organ
 from palpate.tissue.geometry import subdivide
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array
 
 _TINY = 2e-3  # weight below which a vertex does not count in a vertex of the skin
-_CHUNK = 250  # columns of the skin's matrix at a time
 
 
 class Surface:
@@ -135,20 +134,9 @@ def look(model: mj.MjModel, material: int, rgba: Sequence[float]) -> dict[str, A
 
 @functools.lru_cache(maxsize=4)
 def _weights(content: bytes, level: int) -> csr_array:
-  """Returns what an organ's vertices count in each of its skin's, without what is next to nothing.
-
-  The weights of a fine vertex add up to 1.
-  """
+  """Returns what an organ's vertices count in each of its skin's."""
   elem = np.frombuffer(content, np.int32).reshape(-1, 3)
-  fine, count = subdivide.smooth(elem, level), int(elem.max()) + 1
-  columns = []
-  for first in range(0, count, _CHUNK):
-    unit = np.eye(count, min(_CHUNK, count - first), -first)
-    weight = fine(unit).T
-    columns.append(csr_array(np.where(np.abs(weight) > _TINY, weight, 0.0)))
-  out = csr_array(vstack(columns).T)
-  out.data /= np.repeat(np.asarray(out.sum(axis=1)).ravel(), np.diff(out.indptr))
-  return out
+  return subdivide.smooth(elem, level).weights(_TINY)
 
 
 def _opened(whole: np.ndarray, elem: np.ndarray) -> np.ndarray:

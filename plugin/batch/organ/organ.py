@@ -24,22 +24,23 @@ from palpate.tissue.cutting.topology import Report, pieces
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import fill
 
-from . import bonds, host, kernels, needles, patch
-from .base import Contacts, Tissue, spread
-from .contact import contact_rows, contacts, convex, edges
-from .cutting import blades
-from .cutting.cuts import Cuts
-from .cutting.fracture import Cutters
+from .. import bonds, kernels, needles
+from ..base import Contacts, Tissue, spread
+from ..contact import contact_rows, contacts, convex, edges
+from ..cutting import blades
+from ..cutting.cuts import Cuts
+from ..cutting.fracture import Cutters
+from ..mjw.arrays import arrays_of
+from ..strip_organs import Slots
+from . import host, patch
 from .material import KEYS, Material
 from .patch import launch
-from .strip_organs import Slots
-from .warp_arrays import arrays_of
 
 if TYPE_CHECKING:
   from palpate.engine.workspace import Workspace
 
-  from .rods import Thread
-  from .worlds import Worlds
+  from ..rods import Thread
+  from ..worlds import Worlds
 
 _WHAT = {"xpos": 0, "xvel": 1, "contact_force": 2}
 _STATUS = {"iterations": 0, "residual": 1}

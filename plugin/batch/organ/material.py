@@ -18,8 +18,8 @@ from .lumps import Lumps
 from .patch import GRADES, Patch
 
 if TYPE_CHECKING:
-  from .organs import Organ
-  from .worlds import Worlds
+  from ..worlds import Worlds
+  from .organ import Organ
 
 _PLAIN = ("foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness")
 # What may change: numbers of the tissue, what its moduli follow from, and what else.

@@ -15,7 +15,7 @@ from palpate.tissue import step
 from palpate.tissue.cutting.facets import World
 from palpate.tissue.types import Array, Tissue, doubles, fill, floats, ints, vector, zeros
 
-from .warp_arrays import theirs
+from ..mjw.arrays import theirs
 
 if TYPE_CHECKING:
   from palpate.engine.model.declare import Declaration

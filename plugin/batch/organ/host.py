@@ -18,11 +18,11 @@ from palpate.tissue import body as bodies
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import DIMS, fill
 
-from .kernels import forget, put_back_rows
+from ..kernels import forget, put_back_rows
 
 if TYPE_CHECKING:
-  from .organs import Organ
-  from .worlds import Worlds
+  from ..worlds import Worlds
+  from .organ import Organ
 
 _BLOCK = 32  # threads of a block, a warp: with several sizes modules would be compiled for each
 

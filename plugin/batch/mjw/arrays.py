@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import mujoco_warp as mjw
-from palpate.tissue.types import Array, struct
+from palpate.tissue.types import Array, lent
 
 # Where mujoco_warp's arrays are: what has them, of a model and its data.
 _OWNERS: dict[str, tuple[type, Callable[[Any, Any], Any]]] = {
@@ -26,17 +26,16 @@ def theirs(contacts: str = "", **names: str) -> Callable[[type], Any]:
     contacts: what the names of those of contacts begin with
     **names: those of each of `_OWNERS`, apart by spaces
   """
+  found, kinds = {}, {}
+  for owner, each in names.items():
+    for name in each.split():
+      field = (contacts if owner == "contact" else "") + name
+      found[field], array = (owner, name), _OWNERS[owner][0].__annotations__[name]
+      kinds[field] = Array(array.dtype, array.shape)
 
   def made(cls: type) -> Any:
-    found, kinds = {}, {}
-    for owner, each in names.items():
-      for name in each.split():
-        field = (contacts if owner == "contact" else "") + name
-        found[field], array = (owner, name), _OWNERS[owner][0].__annotations__[name]
-        kinds[field] = Array(array.dtype, array.shape)
     _THEIRS[cls.__name__] = found
-    cls.__annotations__ = cls.__annotations__ | kinds
-    return struct(cls)
+    return lent(kinds)(cls)
 
   return made
 

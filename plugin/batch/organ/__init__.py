@@ -1,0 +1,1 @@
+"""An organ in all worlds of a batch on a device."""
