@@ -60,7 +60,7 @@ class Rest:
     for thread in batch.rods.all.values():
       f = thread.fields
       self.starts += [_start(f.now, thread.declared.rest)]
-      own = f.speed, thread.twist, thread.force, thread.broken
+      own = f.speed, thread.twist, thread.borne, thread.broken
       self.starts += [_start(array) for array in own]
     self._rows = self.starts + [_start(array) for array in zero if array.size]
     self._move = move = kernels.Move()

@@ -37,7 +37,7 @@ _ITERATIONS = 60  # of a step, at most: all worlds wait for the one that takes l
   model="M_rowadr M_rownnz M_colind",
   data="qpos qvel qfrc_applied xfrc_applied qfrc_passive qfrc_smooth qacc qacc_warmstart M nefc",
   contact="dim flex elem geom friction",
-  efc="type id J J_rownnz J_rowadr J_colind D aref",
+  efc="type id J J_rownnz J_rowadr J_colind D aref force",
 )
 class WorldRods:
   """A thread in all worlds, and mujoco_warp's arrays under their own names."""
@@ -102,10 +102,10 @@ class Thread(base.Thread):
     mass = space.mass
     shared = space.constants | rods.settings(organ, space.friction) | {"mass": mass}
     shared["newton"] = min(shared["newton"], _ITERATIONS)
-    self.twist, self.broken, self.force = (
-      wp.zeros((nworld, n, *more), dtype=wp.float64, device=device) for more in ((), (), (3,))
+    self.twist, self.broken, self.borne = (
+      wp.zeros((nworld, size), dtype=wp.float64, device=device) for size in (n, n, bare.nv)
     )
-    own = {"twist": self.twist, "force": self.force, "broken": self.broken}
+    own = {"twist": self.twist, "borne": self.borne, "broken": self.broken}
     own["signature"] = wp.zeros((nworld, 1), dtype=wp.float64, device=device)
     each = {
       name: _rows(Rod, name, start, nworld, device) for name, start in rods.scratch(n).items()
@@ -194,8 +194,11 @@ class Thread(base.Thread):
     data.qpos[organ.qposs] = self._batch.model.qpos0[organ.qposs] + moved
     data.qvel[organ.dofs] = speed[organ.free].ravel()
     own = self._own(data)
-    for name in ("twist", "force", "broken"):
+    for name in ("twist", "broken"):
       getattr(own, name)[:] = getattr(self, name)[world].numpy()
+    kept = self._batch.kept[1]
+    own.borne[:] = 0.0
+    own.borne[kept] = self.borne[world].numpy()[: len(kept)]
     own.signature[:] = organ.signature
 
   def push(self, world: int, data: mujoco.MjData):
@@ -208,13 +211,16 @@ class Thread(base.Thread):
       if name == "now":
         row[organ.free] -= self._batch.model.qpos0[adr].reshape(-1, 3) - organ.rest[organ.free]
       array[world].assign(row)
-    for name in ("twist", "force", "broken"):
+    for name in ("twist", "broken"):
       getattr(self, name)[world].assign(getattr(own, name))
+    borne, kept = np.zeros(self.borne.shape[1]), self._batch.kept[1]
+    borne[: len(kept)] = own.borne[kept]
+    self.borne[world].assign(borne)
 
   def _own(self, data: mujoco.MjData):
     """Returns views of its part of the plugin state."""
     start = self._batch.model.plugin_stateadr[self.space.instance]
-    return rods.state_of(data.plugin_state[start:], len(self.declared.rest))
+    return rods.state_of(data.plugin_state[start:], len(self.declared.rest), self._batch.model.nv)
 
 
 class Rods:

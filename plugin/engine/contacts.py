@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _DATA = (
   *("contact", "ncon", "nefc", "nisland", "efc_type", "efc_id", "efc_J", "efc_J_rownnz"),
   *("efc_J_rowadr", "efc_J_colind", "efc_pos", "efc_margin", "efc_KBIP", "efc_diagA"),
-  *("efc_R", "efc_D", "map_efc2iefc", "iefc_R", "iefc_D"),
+  *("efc_R", "efc_D", "efc_force", "map_efc2iefc", "iefc_R", "iefc_D"),
 )
 _CONTACT = (
   *("dist", "pos", "frame", "friction", "solref", "solimp", "mu", "dim", "geom", "flex", "elem"),

@@ -314,7 +314,7 @@ class RodState:
   """Plugin state of a thread, see `rods`."""
 
   twist: doubles("nvert")  # twist at each node between two edges, 0 at the ends [rad]
-  force: doubles("nvert", 3)  # constraint force on each node in the last step [N]
+  borne: doubles("nv")  # generalized force of its constraints on other bodies in the last step
   broken: doubles("nvert")  # whether an edge has broken
   signature: doubles(1)  # of the thread; 0 where it was set by hand [-]
 

@@ -25,6 +25,7 @@ from .model import declare, flexes, mjstruct, prepare
 from .workspace import Report, Seen
 
 _MOST_ROWS = 48  # of MuJoCo's constraints, for one node
+_MOST_BODIES = 12  # nodes that stand for bodies which yield, three of their coordinates each
 # Centre lines come no nearer than this share of the diameter; neighbours along the thread, with no
 # more than this many radii between them, are not looked at.
 CORE, NEIGHBOURS = 0.5, 3.5
@@ -42,7 +43,8 @@ _WRITTEN = (
   *("start", "vel", "external", "aim", "place", "turn", "force", "move", "trial", "gradient"),
   *("matrix", "inverse", "rank", "near", "ranked", "first", "start_of_row", "below", "status"),
   *("count", "smooth", "reach", "listed", "pair", "pressure", "touch"),
-  *("row_kind", "row_node", "row_value", "grip"),
+  *("row_kind", "row_node", "row_efc", "row_tree", "row_yields", "row_body"),
+  *("row_value", "grip"),
 )
 _HUGE = 1e6  # more than any twist [rad]
 
@@ -55,6 +57,7 @@ class Rod:
   newton: int  # most iterations of a step
   twists: int  # whether it resists twisting
   most_rows: int  # MuJoCo's rows that there is room for
+  most_nodes: int  # nodes that there is room for, with those that stand for bodies
   collides: int  # whether it meets itself
   most_pairs: int  # pairs of its edges that there is room for
   shortest: float  # length of its shortest edge [m]
@@ -72,13 +75,13 @@ class Rod:
   mass: doubles("nnode")  # of a node [kg]
   drag: doubles("nnode")  # force against a node by its velocity [N s/m]
   spin: doubles("nnode")  # inertia of an edge about itself [kg m^2]
-  held: ints("nunknown")  # whether an unknown does not change
+  held: ints("nheld")  # whether an unknown does not change
   # A step:
   start: doubles("nnode", 3)  # place as it begins, in the slides' axes [m]
   vel: doubles("nnode", 3)  # velocity then [m/s]
   external: doubles("nnode", 3)  # force besides elasticity and constraints [N]
   aim: doubles("nnode", 3)  # place where it would end without these [m]
-  place: doubles("nnode", 3)  # place as it ends [m]
+  place: doubles("nplace", 3)  # place as it ends [m]
   turn: doubles("nnode")  # turn of an edge about itself in the step [rad]
   force: doubles("nunknown")  # force of the constraints in the rod's step, negative [N]
   move: doubles("nunknown")  # change of the unknowns
@@ -86,14 +89,15 @@ class Rod:
   gradient: doubles("nunknown")  # of what a step makes least
   matrix: doubles("nentry")  # its second derivative, and the factors of that, see `Envelope`
   inverse: doubles("nentry")  # of the matrix without constraints, there
-  rank: ints("nnode")  # of a node in the matrix
-  near: ints("nnode + 1", "nword_node")  # a bit for each two nodes: neighbours in the matrix
+  rank: ints("nplace")  # of a node in the matrix
+  near: ints("nplace + 1", "nword_node")  # a bit for each two nodes: neighbours in the matrix
   ranked: doubles("nunknown", 4)  # scratch
   first: ints("nunknown")  # first column of each row
   start_of_row: ints("nunknown")  # where it is
   below: ints("nunknown")  # scratch
   status: ints(1)  # iterations; -1: not finite; more than `newton`: not solved
-  count: ints(3)  # rows of constraints that act on the rod; pairs of edges listed; entries
+  count: ints(4)  # rows of constraints that act on the rod; pairs of edges listed; entries; nodes
+    # that stand for bodies
   smooth: doubles(1)  # velocity below which friction is viscous in this step [m/s]
   reach: doubles(1)  # how far these may be apart before they touch [m]
   listed: doubles("nnode", 3)  # place where these were listed [m]
@@ -102,6 +106,10 @@ class Rod:
   touch: doubles("npair", 5)  # where and how it acts, see `TOUCH`
   row_kind: ints("nrow")  # see `RowKind`
   row_node: ints("nrow")  # the first of the two nodes
+  row_efc: ints("nrow")  # its number in MuJoCo
+  row_tree: ints("nrow")  # tree of bodies that it reaches, if that yields to the rod, or -1
+  row_yields: ints("nrow")  # first of the nodes that stand for that, or -1
+  row_body: doubles("nrow", 12)  # J of these
   row_value: doubles("nrow", 9)  # J of their dofs; J a of other bodies less aref; D; friction
   grip: ints("nnode")  # tree of bodies that holds a node or one near it, or -1
   tie_count: ints(1)  # what holds it, see `coupling.Ties`
@@ -225,6 +233,7 @@ def settings(organ: Declaration, friction: float) -> dict:
   return dict(
     newton=organ.config.iterations,
     most_rows=_MOST_ROWS * n,
+    most_nodes=n + _MOST_BODIES,
     most_pairs=_MOST_PAIRS * n,
     collides=1,
     radius=organ.radius,
@@ -238,14 +247,16 @@ def settings(organ: Declaration, friction: float) -> dict:
 
 def scratch(n: int) -> dict[str, np.ndarray]:
   """Returns the fields of `Rod` that a step of n nodes writes."""
-  sizes = {"nnode": n, "nunknown": 4 * n, "npair": _MOST_PAIRS * n, "nrow": _MOST_ROWS * n}
-  return zeros(_WRITTEN, sizes | {"nentry": 2 * n * (4 * n + 1), "nword_node": -(-n // 32)}, (Rod,))
+  most = n + _MOST_BODIES
+  sizes = {"nnode": n, "nplace": most, "nunknown": 4 * most, "npair": _MOST_PAIRS * n}
+  sizes |= {"nrow": _MOST_ROWS * n, "nentry": 2 * most * (4 * most + 1)}
+  return zeros(_WRITTEN, sizes | {"nword_node": -(-most // 32)}, (Rod,))
 
 
-def state_of(state: np.ndarray, n: int) -> Views:
+def state_of(state: np.ndarray, n: int, nv: int) -> Views:
   """Returns `RodState` of a thread of n nodes, as views of its part of a plugin state."""
   array = wp.array(state, dtype=wp.float64, device="cpu", copy=False)
-  return Views(layout.carve(RodState, array, {"nvert": n}))
+  return Views(layout.carve(RodState, array, {"nvert": n, "nv": nv}))
 
 
 def _check(m, flex: int, name: str):
@@ -292,7 +303,7 @@ class Workspace:
     """Takes the arrays of an mjModel and of the mjData, and records the launches."""
     m, organ = mjstruct.Model.from_address(model), self.organ
     n, dofs = len(organ.rest), np.maximum(organ.dofadr, 0)[:, None] + np.arange(3)
-    sizes = {"nvert": n}
+    sizes = {"nvert": n, "nv": m.nv}
     size = layout.size(RodState, sizes)
     self.state = coupling.plugin_state(model, self.data, self.instance, size)
     found = coupling.mujoco_arrays(model, self.data, Bound)

@@ -312,6 +312,44 @@ def test_jaws_hold_a_thread_by_friction(condim, share, holds):
     assert thread.error is None
 
 
+def pinch(h, tension=0.0, slack=0.0, n=61):
+  """Returns MJCF of jaws of 20 g about a thread that is straight, or an arc between its ends."""
+  jaws = "".join(
+    f"""<body pos="0 0 {slack - way * 0.003}"><joint name="jaw{k}" type="slide" axis="0 0 {way}"
+      damping="20"/><geom type="box" size="0.002 0.002 0.001" mass="0.02" friction="0.5"
+      solref="0.002 1" solmix="1000"/></body>"""
+    for k, way in enumerate((-1, 1))
+  )
+  points = line(n, 0.027, -0.0135)
+  points[:, 2] = slack * np.cos(0.5 * np.pi * np.linspace(-1, 1, n))
+  option = f'{FREE} cone="elliptic" impratio="10"'
+  motors = "<actuator>" + "".join(f'<motor joint="jaw{k}"/>' for k in range(2)) + "</actuator>"
+  pin, contact = (0,) if tension else (0, n - 1), 'friction="0.3 0 0"'
+  return document(
+    points, pin=pin, h=h, option=option, world=jaws, after=motors, contact=contact, bend=0.02
+  )
+
+
+@pytest.mark.parametrize("h", [5e-4, 1e-3, 2e-3])
+@pytest.mark.parametrize(("tension", "slack"), [(0, 0), (0.03, 0), (0, 0.002)])
+def test_jaws_that_close_on_a_thread_press_with_their_own_force(h, tension, slack):
+  """At 0.1 m/s with 2 N. Within a step the thread weighs more along itself than the jaws do."""
+  model, data, thread = loaded(pinch(h, tension, slack))
+  if tension:
+    force(model, data, 60, (tension, 0, 0))
+  data.ctrl[:] = press = 2.0
+  contact, pressed = np.zeros(6), np.zeros((round(0.15 / h), 2))
+  for k in range(len(pressed)):
+    run(model, data, 1)
+    for c in range(data.ncon):
+      mujoco.mj_contactForce(model, data, c, contact)
+      pressed[k, data.contact[c].geom[0]] += contact[0]
+  assert pressed.max() < 1.2 * press
+  np.testing.assert_allclose(pressed[len(pressed) // 2 :], press, rtol=0.01)
+  assert thread.tension.max() < tension + 0.2
+  assert thread.error is None
+
+
 def hand(n=41):
   """Returns jaws that close on a thread in the middle, where an equality holds it."""
   jaws = "".join(

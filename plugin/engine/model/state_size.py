@@ -13,7 +13,7 @@ def state_size(model: int, instance: int) -> int:
   """Returns the length of the plugin state: at least what `coupling.sizes` will ask for."""
   m = mjstruct.Model.from_address(model)
   if declare.is_rod(model, instance):
-    return layout.size(RodState, {"nvert": m.nflexvert})
+    return layout.size(RodState, {"nvert": m.nflexvert, "nv": m.nv})
   relaxes, rests, bonded = (
     bool(mjstruct.config(model, instance, key).strip())
     for key in ("relax_share", "support", "bonds")

@@ -22,6 +22,7 @@ struct MujocoRod {
     return -(kbip[1] * velocity(f, r) + kbip[0] * kbip[2] * gap);
   }
   PALPATE double stiffness(int r) const { return datum<double*>(f, DATA_EFC_D)[r]; }
+  PALPATE double force(int r) const { return datum<double*>(f, DATA_EFC_FORCE)[r]; }
   PALPATE double last_acceleration(int dof) const { return f.qacc_warmstart.data[dof]; }
 
   PALPATE bool moves(int i) const { return f.dofadr.data[i] >= 0; }
@@ -84,14 +85,17 @@ struct MujocoRod {
         continue;
       }
       const double margin = f.flex_margin.data[f.flex];
-      if (side_of(contact, CONTACT_FLEX, 0) >= 0 && side_of(contact, CONTACT_FLEX, 1) >= 0)
-        keep_closed(f, contact, rows, margin);  // with an organ
+      const bool organ = side_of(contact, CONTACT_FLEX, 0) >= 0 && side_of(contact, CONTACT_FLEX, 1) >= 0;
+      if (organ)
+        keep_closed(f, contact, rows, margin);
       else
         set_gap(f, rows, *(const double*)(contact + CONTACT_DIST) + margin);
       note_contact(*this, rows.first, rows.count, !rows.paired && rows.count > 1,
-                   *(const double*)(contact + CONTACT_MU), (const double*)(contact + CONTACT_FRICTION));
+                   *(const double*)(contact + CONTACT_MU), (const double*)(contact + CONTACT_FRICTION), !organ);
     }
-    note_joints(*this, nefc, datum<int*>(f, DATA_EFC_TYPE), datum<int*>(f, DATA_EFC_ID));
+    const int* type = datum<int*>(f, DATA_EFC_TYPE);
+    note_joints(*this, nefc, type);
+    yield_trees(*this, nefc, type, datum<int*>(f, DATA_EFC_ID));
   }
 
   // Reads MuJoCo's arrays: where the step begins, and where it leads with no stiffness.

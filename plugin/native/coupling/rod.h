@@ -1,8 +1,9 @@
 // The coupling of a rod to MuJoCo.
 //
-// The rod's step is taken with the constraints that MuJoCo has found for this step, on bodies that move on as
-// they did; those that an equality joins to it yield to its force, as far as other constraints do not hold them. So it
-// reaches MuJoCo as a force on its nodes,
+// The rod's step is taken with the constraints that MuJoCo has found for this step, on bodies that go on as they did
+// but for what they yield to the rod by their inertia, as far as other constraints do not hold them: jaws of 20 g that
+// met the 0.8 kg of a taut thread, its stiffness times h^2, would be thrown off by a force that they never pressed
+// with. So it reaches MuJoCo as a force on its nodes,
 //
 //   qfrc_passive = Mhat (v1 - v) / h - f_ext - f_c,
 //
@@ -40,17 +41,15 @@ PALPATE int first_node(const Host& host, Row row) {
   return last - first > 1 ? APART : first;
 }
 
-// Most dofs of what an equality joins to a rod; others stand still in its step.
-constexpr int MOST_DOFS = 16;
-
-// What an equality joins to the rod, by its dofs: how it gives way to a force. It does so against its inertia and against
-// the constraints that held it in the last step: a needle weighs little beside the jaws that hold it. Their other side
-// gives way by each of its dofs alone.
+// A tree of bodies that yields to the rod in its step, by those of its dofs that the rod's constraints reach, up to
+// REACH; others stand still. It does so against its inertia and against the other constraints that held it in the last
+// step: a needle weighs little beside the jaws that hold it. Their other side yields by each of its dofs alone.
 template <class Host>
-struct Joined {
+struct Tree {
   const Host& host;
-  int count = 0, dof[MOST_DOFS];
-  double L[MOST_DOFS][MOST_DOFS];  // lower triangle: inertia, then its factor by Cholesky
+  int count = 0, dof[REACH];
+  double L[REACH][REACH];  // lower triangle: inertia, then its factor by Cholesky
+  double last[REACH];  // L^-1 of the force that the rod put on it in the last step
 
   PALPATE int find(int d) const {
     for (int k = 0; k < count; ++k)
@@ -64,7 +63,7 @@ struct Joined {
   PALPATE void take(Row row) {
     for (int k = 0; k < row.count; ++k) {
       const int d = row.dof ? row.dof[k] : k;
-      if (row.value[k] == 0.0 || host.own_dof(d) >= 0 || find(d) >= 0 || count == MOST_DOFS) continue;
+      if (row.value[k] == 0.0 || host.own_dof(d) >= 0 || find(d) >= 0 || count == REACH) continue;
       dof[count] = d;
       for (int b = 0; b <= count; ++b) L[count][b] = 0.0;
       ++count;
@@ -78,9 +77,9 @@ struct Joined {
       }
   }
   // Adds what row `r` holds it by, where that bore in the last step or does always; returns whether it did.
-  PALPATE bool hold(int r, bool always) {
+  PALPATE bool hold_by(int r, bool always) {
     const auto row = host.row(r);
-    double J[MOST_DOFS] = {}, gives = 0.0, goes = 0.0;
+    double J[REACH] = {}, gives = 0.0, goes = 0.0;
     bool here = false;
     for (int k = 0; k < row.count; ++k) {
       const int d = row.dof ? row.dof[k] : k, own = find(d);
@@ -96,6 +95,17 @@ struct Joined {
       for (int b = 0; b <= a; ++b) L[a][b] += J[a] * J[b] / gives;
     return true;
   }
+  // Adds all that holds it.
+  PALPATE void hold(int nefc, const int* type, const int* id) {
+    bool held = false;
+    for (int k = 0; k < nefc; ++k) {
+      if (type[k] != IS_EQUALITY && type[k] < IS_LIMIT) continue;  // friction of joints
+      const bool tangent = k > 0 && type[k] == CONTACT_ELLIPTIC && type[k - 1] == type[k] && id[k - 1] == id[k];
+      if (tangent && held) hold_by(k, true);
+      if (!tangent) held = hold_by(k, type[k] == IS_EQUALITY);
+    }
+  }
+  // Factorizes its inertia, and finds what the rod's last force is in its coordinates.
   PALPATE void factorize() {
     for (int a = 0; a < count; ++a)
       for (int b = 0; b <= a; ++b) {
@@ -103,21 +113,24 @@ struct Joined {
         for (int k = 0; k < b; ++k) sum -= L[a][k] * L[b][k];
         L[a][b] = a == b ? sqrt(sum) : sum / L[b][b];
       }
+    for (int a = 0; a < count; ++a) last[a] = host.rod.own.borne.data[dof[a]];
+    solve(last);
   }
-  // J M^-1 J^T of a row [1/kg].
-  template <class Row>
-  PALPATE double yields(Row row) const {
-    double x[MOST_DOFS] = {}, sum = 0.0;
-    for (int k = 0; k < row.count; ++k) {
-      const int a = find(row.dof ? row.dof[k] : k);
-      if (a >= 0) x[a] = row.value[k];
-    }
+  PALPATE void solve(double* x) const {  // by the lower factor
     for (int a = 0; a < count; ++a) {
       for (int b = 0; b < a; ++b) x[a] -= L[a][b] * x[b];
       x[a] /= L[a][a];
-      sum += x[a] * x[a];
     }
-    return sum;
+  }
+  // Writes L^-1 J^T of a row to x, REACH long.
+  template <class Row>
+  PALPATE void reach(Row row, double* x) const {
+    for (int a = 0; a < REACH; ++a) x[a] = 0.0;
+    for (int k = 0; k < row.count; ++k) {
+      const int a = row.value[k] == 0.0 ? -1 : find(row.dof ? row.dof[k] : k);
+      if (a >= 0) x[a] = row.value[k];
+    }
+    solve(x);
   }
 };
 
@@ -132,6 +145,7 @@ PALPATE bool note_row(const Host& host, int r, int kind, double friction, int co
   if (node < 0 || at >= rod.most_rows) return false;
   double* J = rod.row_value.data + (DOFS + 3) * at;
   double sum = -host.reference(r);
+  int tree = NOWHERE;
   for (int k = 0; k < DOFS; ++k) J[k] = 0.0;
   for (int k = 0; k < row.count; ++k) {
     if (row.value[k] == 0.0) continue;
@@ -139,13 +153,16 @@ PALPATE bool note_row(const Host& host, int r, int kind, double friction, int co
     if (own >= 0)
       J[own - 3 * node] = row.value[k];
     else
-      sum += row.value[k] * host.last_acceleration(dof);
+      sum += row.value[k] * host.last_acceleration(dof), tree = host.f.dof_tree.data[dof];
   }
   J[DOFS] = sum;
   J[DOFS + 1] = host.stiffness(r);
   J[DOFS + 2] = friction;
   rod.row_node.data[at] = node;
   rod.row_kind.data[at] = kind;
+  rod.row_efc.data[at] = r;
+  rod.row_tree.data[at] = tree;
+  rod.row_yields.data[at] = NOWHERE;
   rod.count.data[0] = at + 1;
   return true;
 }
@@ -170,9 +187,10 @@ PALPATE void note_grips(const Host& host, int nefc, const int* type) {
   }
 }
 
-// Notes the rows of a contact, of a cone where `mu` says so: whole or not at all.
+// Notes the rows of a contact, of a cone where `mu` says so, whole or not at all; `yields`: its other side does.
 template <class Host, class Number>
-PALPATE void note_contact(const Host& host, int first, int count, bool cone, double mu, const Number* friction) {
+PALPATE void note_contact(
+    const Host& host, int first, int count, bool cone, double mu, const Number* friction, bool yields) {
   const int before = host.rod.count.data[0];
   for (int k = 0; k < count; ++k) {
     const double slope = !cone ? 0.0 : k ? (double)friction[k - 1] : mu;
@@ -182,52 +200,53 @@ PALPATE void note_contact(const Host& host, int first, int count, bool cone, dou
     host.rod.count.data[0] = before;
     break;
   }
-}
-
-// Notes the rows of an equality, from `r` on. What it joins to the rod does not go on as it did: from its last
-// acceleration the row's last force is taken off, and it gives way to the new one. It does so by as much as in all
-// rows together, no less than in any direction: too little would overshoot.
-template <class Host>
-PALPATE void note_equality(const Host& host, int r, int count, int nefc, const int* type, const int* id) {
-  const auto& rod = host.rod;
-  const int from = rod.count.data[0];
-  for (int k = 0; k < count; ++k) note_row(host, r + k, BOTH, 0.0);
-  if (rod.count.data[0] == from) return;
-  Joined<Host> other{host};
-  for (int k = 0; k < count; ++k) other.take(host.row(r + k));
-  other.weigh();
-  bool held = false;
-  for (int k = 0; k < nefc; ++k) {
-    if (type[k] != IS_EQUALITY && type[k] < IS_LIMIT) continue;  // friction of joints
-    const bool tangent = k > 0 && type[k] == CONTACT_ELLIPTIC && type[k - 1] == type[k] && id[k - 1] == id[k];
-    if (tangent && held) other.hold(k, true);
-    if (!tangent) held = other.hold(k, type[k] == IS_EQUALITY);
-  }
-  other.factorize();
-  double way = 0.0;
-  for (int k = 0; k < count; ++k) way += other.yields(host.row(r + k));
-  for (int at = from; at < rod.count.data[0]; ++at) {
-    double* J = rod.row_value.data + (DOFS + 3) * at;
-    const double* last = rod.own.force.data + 3 * rod.row_node.data[at];
-    double before = 0.0, length2 = 0.0;
-    for (int k = 0; k < DOFS; ++k) {
-      if (J[k] == 0.0) continue;
-      before += J[k] * last[k];
-      length2 += J[k] * J[k];
-    }
-    J[DOFS] -= way * before / length2;
-    J[DOFS + 1] /= 1.0 + J[DOFS + 1] * way;
-  }
+  int* tree = host.rod.row_tree.data;  // of all rows alike: a slide's normal may reach what its tangents do not
+  int reached = NOWHERE;
+  for (int at = before; at < host.rod.count.data[0]; ++at) reached = tree[at] > reached ? tree[at] : reached;
+  for (int at = before; at < host.rod.count.data[0]; ++at) tree[at] = yields ? reached : NOWHERE;
 }
 
 // Notes the rows of equalities, and of limits.
 template <class Host>
-PALPATE void note_joints(const Host& host, int nefc, const int* type, const int* id) {
-  for (int r = 0, count = 1; r < nefc; r += count) {
-    for (count = 1; type[r] == IS_EQUALITY && r + count < nefc && type[r + count] == IS_EQUALITY && id[r + count] == id[r];)
-      ++count;
-    if (type[r] == IS_EQUALITY) note_equality(host, r, count, nefc, type, id);
+PALPATE void note_joints(const Host& host, int nefc, const int* type) {
+  for (int r = 0; r < nefc; ++r) {
+    if (type[r] == IS_EQUALITY) note_row(host, r, BOTH, 0.0);
     if (type[r] == IS_LIMIT) note_row(host, r, ONE, 0.0);
+  }
+}
+
+// Lets the tree of bodies that row `first` reaches yield in the rod's step, by coordinates in which its inertia is
+// 1 kg, three to a node. From its last acceleration what the rod did to it is taken off. A tree for which there is no
+// room goes on as it did.
+template <class Host>
+PALPATE void yield_tree(const Host& host, int first, int nefc, const int* type, const int* id) {
+  const auto& rod = host.rod;
+  const int n = rod.count.data[0], tree = rod.row_tree.data[first], node = nodes_of(rod);
+  Tree<Host> other{host};
+  for (int at = first; at < n; ++at)
+    if (rod.row_tree.data[at] == tree) other.take(host.row(rod.row_efc.data[at]));
+  if (node + REACH / 3 > rod.most_nodes) return;
+  rod.count.data[3] += (other.count + 2) / 3;
+  other.weigh();
+  other.hold(nefc, type, id);
+  other.factorize();
+  for (int at = first; at < n; ++at) {
+    if (rod.row_tree.data[at] != tree) continue;
+    double* J = rod.row_body.data + REACH * at;
+    other.reach(host.row(rod.row_efc.data[at]), J);
+    for (int a = 0; a < other.count; ++a) rod.row_value.data[(DOFS + 3) * at + DOFS] -= J[a] * other.last[a];
+    rod.row_yields.data[at] = node;
+  }
+}
+
+// Lets the bodies that the noted rows reach yield.
+template <class Host>
+PALPATE void yield_trees(const Host& host, int nefc, const int* type, const int* id) {
+  const int* tree = host.rod.row_tree.data;
+  for (int first = 0; first < host.rod.count.data[0]; ++first) {
+    bool done = tree[first] < 0;
+    for (int at = 0; at < first && !done; ++at) done = tree[at] == tree[first];
+    if (!done) yield_tree(host, first, nefc, type, id);
   }
 }
 
@@ -253,10 +272,9 @@ PALPATE double alone(const Rod& rod, int i, double h) {
 template <class Host>
 PALPATE void begin(const Host& host, double h) {
   const auto& rod = host.rod;
-  const int n = 4 * rod.nnode;
   host.gather(h);
   one_lane([&] {
-    rod.count.data[0] = 0;
+    rod.count.data[0] = rod.count.data[3] = 0;
     host.note_rows();
   });
   const int status = step_rod(rod, h);
@@ -268,7 +286,7 @@ PALPATE void begin(const Host& host, double h) {
   if (touched) {
     const RodMatrix H = matrix_of(rod);
     one_lane([&] { lay_out(rod, rod.place.data); });
-    each_lane(0, n, [&](int a) { rod.force.data[a] = 0.0; });
+    each_lane(0, 4 * nodes_of(rod), [&](int a) { rod.force.data[a] = 0.0; });
     rows_cost(rod, rod.place.data, h, rod.force.data, &H);
     // What is not positive is left out: a thread about to buckle gives way at once, and tools would meet nothing.
     assemble(rod, rod.place.data, rod.turn.data, h, rod.gradient.data, false);
@@ -320,16 +338,36 @@ PALPATE void break_edge(const Rod& rod) {
   rod.own.twist.data[weakest + 1] = 0.0;
 }
 
+// Keeps the force that the rod puts on other bodies.
+template <class Host>
+PALPATE void note_borne(const Host& host) {
+  const auto& rod = host.rod;
+  each_lane(0, host.f.nv, [&](int d) { rod.own.borne.data[d] = 0.0; });
+  one_lane([&] {
+    for (int at = 0; at < rod.count.data[0]; ++at) {
+      if (rod.row_tree.data[at] < 0) continue;
+      const auto row = host.row(rod.row_efc.data[at]);
+      const double force = host.force(rod.row_efc.data[at]);
+      for (int k = 0; k < row.count && force != 0.0; ++k) {
+        const int d = row.dof ? row.dof[k] : k;
+        if (host.own_dof(d) < 0) rod.own.borne.data[d] += row.value[k] * force;
+      }
+    }
+  });
+}
+
 // Ends the step: by the rod's own response to what MuJoCo found otherwise.
 template <class Host>
 PALPATE void end(const Host& host, double h) {
   const auto& rod = host.rod;
+  note_borne(host);
   if (rod.count.data[0] > 0 && rod.status.data[0] >= 0) {
     each_lane(0, rod.nnode, [&](int i) {
       const D3 found = host.moves(i) ? host.found(i) : D3{0.0, 0.0, 0.0};
       store(rod.move.data + 4 * i, host.moves(i) ? found + load(rod.force.data + 4 * i) : found);
       rod.move.data[4 * i + 3] = 0.0;
     });
+    each_lane(4 * rod.nnode, 4 * nodes_of(rod), [&](int a) { rod.move.data[a] = 0.0; });
     solve_nodes(rod, rod.move.data);
     const double part = safe_part(rod, rod.place.data, rod.move.data, 4);
     each_lane(0, rod.nnode, [&](int i) {
@@ -343,7 +381,6 @@ PALPATE void end(const Host& host, double h) {
   one_lane([&] { break_edge(rod); });
   each_lane(0, rod.nnode, [&](int i) {
     if (!host.moves(i)) return;
-    store(rod.own.force.data + 3 * i, host.found(i));
     host.move(i, load(rod.place.data + 3 * i) - load(rod.start.data + 3 * i), h);
   });
 }

@@ -24,6 +24,7 @@ struct WorldRod {
   }
   PALPATE double reference(int r) const { return f.aref.data[r]; }
   PALPATE double stiffness(int r) const { return f.D.data[r]; }
+  PALPATE double force(int r) const { return f.force.data[r]; }
   PALPATE double last_acceleration(int dof) const { return f.qacc_warmstart.data[dof]; }
 
   PALPATE bool moves(int i) const { return f.dofadr.data[i] >= 0; }
@@ -87,9 +88,11 @@ struct WorldRod {
         continue;
       }
       const float* friction = (const float*)f.contact_friction.data + 5 * c;
-      note_contact(*this, r, count, !paired && count > 1, friction[0] / sqrt(f.impratio), friction);
+      note_contact(*this, r, count, !paired && count > 1, friction[0] / sqrt(f.impratio), friction,
+                   flex[0] < 0 || flex[1] < 0);
     }
-    note_joints(*this, nefc, type, f.id.data);
+    note_joints(*this, nefc, type);
+    yield_trees(*this, nefc, type, f.id.data);
   }
 
   PALPATE void gather(double h) const {
@@ -119,7 +122,7 @@ template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
   move_each(world, f.now, f.speed, f.gravity, f.qpos, f.qvel, f.qfrc_applied,
             f.xfrc_applied, f.qfrc_passive, f.qfrc_smooth, f.qacc, f.qacc_warmstart, f.M, f.nefc, f.type, f.id, f.J,
-            f.J_rownnz, f.J_rowadr, f.J_colind, f.D, f.aref);
+            f.J_rownnz, f.J_rowadr, f.J_colind, f.D, f.aref, f.force);
   return f;
 }
 

@@ -1,9 +1,9 @@
 // An implicit Euler step of a rod: the least of
 //
-//   sum m / (2 h^2) |x - x0 - h v - h^2 f / m|^2 + c / (2 h) |x - x0|^2 + E(x) + h^2 sum s(J a - aref),
-//   a = (x - x0 - h v) / h^2,
+//   sum m / (2 h^2) |x - x0 - h v - h^2 f / m|^2 + c / (2 h) |x - x0|^2 + E(x) + h^2 sum s(J a + B b - aref)
+//   + h^2 / 2 |b|^2,   a = (x - x0 - h v) / h^2,
 //
-// c the drag of a node, by Newton's method with a line search. The last sum is MuJoCo's cost of the constraints
+// c the drag of a node and b how bodies yield, in coordinates in which their inertia is 1 kg, by Newton's method with a line search. The last sum is MuJoCo's cost of the constraints
 // that the rod takes part in (Todorov 2014, doi:10.1109/ICRA.2014.6907751), with the rod's own stiffness in place
 // of MuJoCo's inertia. A row's dofs are those of two neighbouring nodes, so the matrix stays banded.
 #pragma once
@@ -36,6 +36,10 @@ struct RodRow {
   PALPATE double rest() const { return J()[DOFS]; }      // what other bodies add, less aref
   PALPATE double D() const { return J()[DOFS + 1]; }
   PALPATE double friction() const { return J()[DOFS + 2]; }  // of a cone's first row, its mu
+  // What yields to it: the first node that stands for that, or less than 0, and the row of these.
+  PALPATE int body() const { return f.row_yields.data[r]; }
+  PALPATE const double* B() const { return f.row_body.data + REACH * r; }
+  PALPATE double at(int c) const { return c < DOFS ? J()[c] : B()[c - DOFS]; }
 
   // J a - aref where the rod's nodes accelerate by (x - x_free) / h^2.
   PALPATE double residual(const double* x, double h) const {
@@ -45,18 +49,33 @@ struct RodRow {
       const int at = 3 * node() + k;
       sum += J()[k] * (x[at] - f.start.data[at] - h * f.vel.data[at]) / (h * h);
     }
+    for (int k = 0; k < REACH && body() >= 0; ++k)
+      if (B()[k] != 0.0) sum += B()[k] * x[3 * body() + k] / (h * h);
     return sum;
   }
 };
 
-// Adds force J to a gradient by place, and stiffness J J^T to the matrix.
+// Adds force J to a gradient by place, and stiffness J J^T to the matrix; B is J of what yields to row `at`.
 template <class Fields>
-PALPATE void add_row(const Fields& f, int node, const double* J, double force, double stiffness, double* g, const RodMatrix* H) {
+PALPATE void add_row(
+    const Fields& f, const RodRow<Fields>& at, const double* J, const double* B, double force, double stiffness, double* g,
+    const RodMatrix* H) {
   Terms<2> terms;
   terms.add(J, force, stiffness);
+  const int node = at.node();
   const int last = node + 1 < f.nnode ? node + 1 : node - 1;  // at the end, of which there is nothing
   const int nodes[2] = {node, last};
   terms.scatter(nodes, g, *H);
+  for (int i = 0; i < REACH / 3 && at.body() >= 0; ++i) {
+    const int body = at.body() + i;
+    const double* b = B + 3 * i;
+    if (b[0] == 0.0 && b[1] == 0.0 && b[2] == 0.0) continue;
+    for (int c = 0; c < 3; ++c) g[4 * body + c] += force * b[c];
+    for (int k = 0; k < (node + 1 < f.nnode ? 2 : 1); ++k)
+      H->add(body, 3, nodes[k], 3, [&](int c, int d) { return stiffness * b[c] * J[3 * k + d]; });
+    for (int k = 0; k <= i; ++k)
+      H->add(body, 3, at.body() + k, 3, [&](int c, int d) { return stiffness * b[c] * B[3 * k + d]; });
+  }
 }
 
 // The cost of a cone (MuJoCo, Computation, elliptic cones) whose first row is r; adds its gradient and
@@ -79,28 +98,29 @@ CALLED double cone(const Fields& f, int r, int dim, const double* x, double h, d
       const RodRow<Fields> row{f, r + k};
       const double residual = u[k] / slope[k];
       cost += 0.5 * row.D() * residual * residual;
-      if (g) add_row(f, row.node(), row.J(), row.D() * residual, row.D() * per, g, H);
+      if (g) add_row(f, row, row.J(), row.B(), row.D() * residual, row.D() * per, g, H);
     }
     return cost;
   }
   const double Dm = first.D() / (mu * mu * (1.0 + mu * mu)), off = N - mu * T;
   cost = 0.5 * Dm * off * off;
   if (!g) return cost;
-  double v[DOFS] = {}, tangent[DOFS] = {};
+  double v[DOFS + REACH] = {}, w[DOFS + REACH], tangent[DOFS + REACH] = {};
+  const int all = first.body() < 0 ? DOFS : DOFS + REACH;
   for (int k = 0; k < dim; ++k) {
     const RodRow<Fields> row{f, r + k};
-    for (int c = 0; c < DOFS; ++c) {
-      v[c] += slope[k] * row.J()[c] * (k ? -mu * u[k] / T : 1.0);
-      if (k) tangent[c] += slope[k] * row.J()[c] * u[k] / T;
+    for (int c = 0; c < all; ++c) {
+      const double J = slope[k] * row.at(c);
+      v[c] += J * (k ? -mu * u[k] / T : 1.0);
+      if (k) tangent[c] += J * u[k] / T;
     }
   }
   const double bends = -Dm * off * mu / T;  // of the length of the tangential part
-  add_row(f, first.node(), v, Dm * off, Dm * per, g, H);
+  add_row(f, first, v, v + DOFS, Dm * off, Dm * per, g, H);
   for (int k = 1; k < dim; ++k) {
     const RodRow<Fields> row{f, r + k};
-    double w[DOFS];
-    for (int c = 0; c < DOFS; ++c) w[c] = slope[k] * row.J()[c] - u[k] / T * tangent[c];
-    add_row(f, row.node(), w, 0.0, bends * per, g, H);
+    for (int c = 0; c < all; ++c) w[c] = slope[k] * row.at(c) - u[k] / T * tangent[c];
+    add_row(f, first, w, w + DOFS, 0.0, bends * per, g, H);
   }
   return cost;
 }
@@ -122,14 +142,18 @@ CALLED double rows_cost(const Fields& f, const double* x, double h, double* g, c
     const double residual = row.residual(x, h);
     if (row.kind() == ONE && residual >= 0.0) return;
     cost += 0.5 * row.D() * residual * residual;
-    if (g) add_row(f, row.node(), row.J(), row.D() * residual, row.D() / (h * h), g, H);
+    if (g) add_row(f, row, row.J(), row.B(), row.D() * residual, row.D() / (h * h), g, H);
   };
   if (!g || TOGETHER == 1) {
     each_lane(0, n, add);
   } else {  // by the nodes that they reach; those of the last one have the one before as well
     each_apart<3>(0, f.nnode, [&](int i) {
       for (int r = 0; r < n; ++r)
-        if (f.row_node.data[r] == i) add(r);
+        if (f.row_node.data[r] == i && f.row_yields.data[r] < 0) add(r);
+    });
+    one_lane([&] {
+      for (int r = 0; r < n; ++r)
+        if (f.row_yields.data[r] >= 0) add(r);
     });
   }
   return cost;
@@ -146,6 +170,7 @@ CALLED double step_cost(const Fields& f, const double* x, const double* turn, do
     sum += 0.5 * f.drag.data[i] / h * dot(moved, moved);
     sum += 0.5 * f.mass.data[i] / (h * h) * dot(off, off) + 0.5 * f.spin.data[i] / (h * h) * turn[i] * turn[i];
   });
+  each_lane(3 * f.nnode, 3 * nodes_of(f), [&](int a) { sum += 0.5 / (h * h) * x[a] * x[a]; });
   const double own = sum + rod_energy(f, x, turn) + contacts_energy(f, x, h, nullptr, nullptr, false) +
                      ties_energy(f, x, nullptr, nullptr) + rows;
   return sum_together(own);
@@ -163,6 +188,11 @@ PALPATE void assemble(const Fields& f, const double* x, const double* turn, doub
     store(g + 4 * i, m * (at - load(f.aim.data + 3 * i)) + c * (at - load(f.start.data + 3 * i)));
     g[4 * i + 3] = spin * turn[i];
     for (int k = 0; k < H.per; ++k) H.at(H.of(i, k), H.of(i, k)) = k < 3 ? m + c : spin;
+  });
+  each_lane(f.nnode, nodes_of(f), [&](int i) {
+    store(g + 4 * i, 1.0 / (h * h) * load(x + 3 * i));
+    g[4 * i + 3] = 0.0;
+    for (int k = 0; k < H.per; ++k) H.at(H.of(i, k), H.of(i, k)) = 1.0 / (h * h);
   });
   add_rod(f, x, turn, g, H, exact);
   contacts_energy(f, x, h, g, &H, exact);
@@ -206,11 +236,11 @@ template <class Fields>
 PALPATE void solve_nodes(const Fields& f, double* b) {
   const RodMatrix H = matrix_of(f);
   double* y = f.ranked.data;
-  each_lane(0, f.nnode, [&](int i) {
+  each_lane(0, nodes_of(f), [&](int i) {
     for (int c = 0; c < H.per; ++c) y[H.of(i, c)] = b[4 * i + c];
   });
   one_lane([&] { solve_factorized(H, y); });
-  each_lane(0, f.nnode, [&](int i) {
+  each_lane(0, nodes_of(f), [&](int i) {
     for (int c = 0; c < 4; ++c) b[4 * i + c] = c < H.per ? y[H.of(i, c)] : 0.0;
   });
 }
@@ -221,6 +251,7 @@ PALPATE void predict(const Fields& f, double h) {
   each_lane(0, f.nnode, [&](int i) { store(f.trial.data + 3 * i, h * load(f.vel.data + 3 * i)); });
   const double part = safe_part(f, f.start.data, f.trial.data, 3);
   each_lane(0, 3 * f.nnode, [&](int a) { f.place.data[a] = f.start.data[a] + part * f.trial.data[a]; });
+  each_lane(3 * f.nnode, 3 * nodes_of(f), [&](int a) { f.place.data[a] = 0.0; });
 }
 
 // Takes the step from f.start and f.vel: f.place and f.turn are where it ends, f.predicted the force of
@@ -228,12 +259,12 @@ PALPATE void predict(const Fields& f, double h) {
 // nothing finite was found.
 template <class Fields>
 PALPATE int step_rod(const Fields& f, double h) {
-  const int n = 4 * f.nnode;
+  const int n = nodes_of(f);
   double* x = f.place.data;
   double* turn = f.turn.data;
   double* g = f.gradient.data;
   double* trial = f.trial.data;
-  double* trial_turn = f.trial.data + 3 * f.nnode;
+  double* trial_turn = f.trial.data + 3 * n;
   const double reach = reach_of(f, h);
   one_lane([&] {
     f.reach.data[0] = reach;
@@ -257,13 +288,13 @@ PALPATE int step_rod(const Fields& f, double h) {
       assemble(f, x, turn, h, g, exact);
       rows_cost(f, x, h, g, &H);
       hold(f, g, H);
-      each_lane(0, n, [&](int a) { f.move.data[a] = -g[a]; });
+      each_lane(0, 4 * n, [&](int a) { f.move.data[a] = -g[a]; });
       if (factorize_nodes(f)) break;
       if (!exact) return -1;
     }
     solve_nodes(f, f.move.data);
     double falls = 0.0, most = 0.0;
-    each_lane(0, n, [&](int a) { falls += g[a] * f.move.data[a]; });
+    each_lane(0, 4 * n, [&](int a) { falls += g[a] * f.move.data[a]; });
     each_lane(0, f.nnode, [&](int i) {
       const double far = norm(load(f.move.data + 4 * i));
       most = far > most ? far : most;
@@ -273,9 +304,9 @@ PALPATE int step_rod(const Fields& f, double h) {
     const double whole = safe_part(f, x, f.move.data, 4);
     double part = whole;
     for (int k = 0; k < HALVINGS; ++k, part *= 0.5) {
-      each_lane(0, f.nnode, [&](int i) {
+      each_lane(0, n, [&](int i) {
         store(trial + 3 * i, load(x + 3 * i) + part * load(f.move.data + 4 * i));
-        trial_turn[i] = turn[i] + part * f.move.data[4 * i + 3];
+        if (i < f.nnode) trial_turn[i] = turn[i] + part * f.move.data[4 * i + 3];
       });
       const double most = cost + SLOPE * part * falls;
       const bool flat = -part * falls < 1e-13 * cost;
@@ -285,7 +316,7 @@ PALPATE int step_rod(const Fields& f, double h) {
         break;
       }
     }
-    each_lane(0, 3 * f.nnode, [&](int a) { x[a] = trial[a]; });
+    each_lane(0, 3 * n, [&](int a) { x[a] = trial[a]; });
     each_lane(0, f.nnode, [&](int i) { turn[i] = trial_turn[i]; });
     // A move that was cut short by contacts is not the last one.
     if ((part * most < CLOSE * f.radius && whole == 1.0) || -falls < ROUNDED * cost) return iteration + 1;

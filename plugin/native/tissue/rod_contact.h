@@ -13,6 +13,8 @@ constexpr double LEFT = 0.2, FOUND = 0.9;
 // node goes in a step.
 constexpr double LISTED = 2.0, AHEAD = 3.0;
 constexpr double STRETCHED = 1.2;  // more than an edge ever is
+// Most dofs of a tree of bodies that yields to the rod.
+constexpr int REACH = 12;
 
 // The points of two segments, from p along d and from q along e, that are nearest (Ericson 2005, 5.1.9).
 struct Nearest {
@@ -119,11 +121,30 @@ PALPATE int bits(unsigned word) { return __builtin_popcount(word); }
 PALPATE int lowest_bit(unsigned word) { return __builtin_ctz(word); }
 #endif
 
+// The nodes, and those that stand for bodies which yield, three of their coordinates each.
+template <class Fields>
+PALPATE int nodes_of(const Fields& f) { return f.nnode + f.count.data[3]; }
+
+// Joins what rows of constraints connect.
+template <class Fields, class Join>
+PALPATE void join_bodies(const Fields& f, Join join) {
+  const int last = nodes_of(f);
+  for (int i = f.nnode; i < last; ++i) join(i, i);
+  for (int r = 0; r < f.count.data[0]; ++r) {
+    const int first = f.row_yields.data[r];
+    for (int body = first; first >= 0 && body < last && body < first + REACH / 3; ++body) {
+      join(body, f.row_node.data[r]);
+      if (f.row_node.data[r] + 1 < f.nnode) join(body, f.row_node.data[r] + 1);
+      for (int other = first; other < body; ++other) join(body, other);
+    }
+  }
+}
+
 // Orders the nodes so that those that have to do with each other are near: next comes, of those that a
 // node before has to do with, the one that adds the fewest (King 1970, doi:10.1002/nme.1620020406).
 template <class Fields>
 CALLED void order_nodes(const Fields& f, const double* x) {
-  const int n = f.nnode, words = (n + 31) / 32;
+  const int n = nodes_of(f), words = (n + 31) / 32;
   unsigned* near = (unsigned*)f.near.data;
   const auto mark = [&](unsigned* row, int i) { row[i / 32] |= 1u << (i % 32); };
   const auto has = [&](const unsigned* row, int i) { return row[i / 32] >> (i % 32) & 1; };
@@ -132,8 +153,9 @@ CALLED void order_nodes(const Fields& f, const double* x) {
     mark(near + i * words, j);
     mark(near + j * words, i);
   };
-  for (int i = 0; i < n; ++i)
-    for (int j = i; j < n && j < i + 3; ++j) join(i, j);
+  for (int i = 0; i < f.nnode; ++i)
+    for (int j = i; j < f.nnode && j < i + 3; ++j) join(i, j);
+  join_bodies(f, join);
   for (int p = 0; p < f.count.data[1]; ++p) {
     const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
     if (!may_be_near(f, x, i, j, 2.5 * f.radius) || norm(nearest_edges(x, i, j).off) > 2.5 * f.radius) continue;
@@ -184,13 +206,13 @@ PALPATE int unknowns_of(const Fields& f) { return f.twists ? 4 : 3; }
 template <class Fields>
 PALPATE RodMatrix matrix_of(const Fields& f) {
   const int per = unknowns_of(f);
-  return {{f.matrix.data, f.first.data, f.start_of_row.data, per * f.nnode}, f.rank.data, per};
+  return {{f.matrix.data, f.first.data, f.start_of_row.data, per * nodes_of(f)}, f.rank.data, per};
 }
 
 // The rows' first columns: of two neighbours along the rod, and of what touches at x or began the step so.
 template <class Fields>
 PALPATE void lay_out(const Fields& f, const double* x) {
-  const int n = f.nnode, per = unknowns_of(f);
+  const int n = nodes_of(f), per = unknowns_of(f);
   const int* rank = f.rank.data;
   int* lowest = f.below.data;  // rank of what a node has to do with
   for (int i = 0; i < n; ++i) lowest[i] = rank[i];
@@ -198,8 +220,9 @@ PALPATE void lay_out(const Fields& f, const double* x) {
     if (rank[i] < lowest[j]) lowest[j] = rank[i];
     if (rank[j] < lowest[i]) lowest[i] = rank[j];
   };
-  for (int i = 0; i < n; ++i)
-    for (int j = i + 1; j < n && j < i + 3; ++j) join(i, j);
+  for (int i = 0; i < f.nnode; ++i)
+    for (int j = i + 1; j < f.nnode && j < i + 3; ++j) join(i, j);
+  join_bodies(f, join);
   for (int p = 0; p < f.count.data[1]; ++p) {
     const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
     if (!(f.pressure.data[p] > 0.0)) {
