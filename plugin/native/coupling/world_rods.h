@@ -89,7 +89,7 @@ struct WorldRod {
       }
       const float* friction = (const float*)f.contact_friction.data + 5 * c;
       note_contact(*this, r, count, !paired && count > 1, friction[0] / sqrt(f.impratio), friction,
-                   flex[0] < 0 || flex[1] < 0);
+                   geom[0] >= 0 || geom[1] >= 0);
     }
     note_joints(*this, nefc, type);
     yield_trees(*this, nefc, type, f.id.data);
