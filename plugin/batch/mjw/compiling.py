@@ -15,6 +15,8 @@ import warp as wp
 from .private import instead
 
 _BLOCK = 256  # threads of a block on CUDA where a launch does not say
+# Told to who asks how many threads and blocks fill a device: to find out, Warp compiles the kernel.
+_FILLING = (_BLOCK, 1)
 
 
 def compile_ahead(device: wp.Device, works: Iterable[Callable[[], Any]]):
@@ -31,7 +33,15 @@ def compile_ahead(device: wp.Device, works: Iterable[Callable[[], Any]]):
   def once(condition, while_body, **kwargs):
     while_body(**kwargs)
 
-  with instead([(wp, "launch", note), (wp, "launch_tiled", note), (wp, "capture_while", once)]):
+  def fill(kernel, device=None):
+    return _FILLING
+
+  with instead([
+    (wp, "launch", note),
+    (wp, "launch_tiled", note),
+    (wp, "capture_while", once),
+    (wp, "get_suggested_block_size", fill),
+  ]):  # fmt: skip
     for work in works:
       work()
   # One pool: `force_load` has one for each size of blocks, and waits for its slowest module.

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any
 
-from mujoco_warp._src import collision_flex, passive, sensor, solver, support
+from mujoco_warp._src import collision_flex, collision_gjk, passive, sensor, solver, support
 from mujoco_warp._src.collision_core import Geom
 from mujoco_warp._src.collision_gjk import ccd
 from mujoco_warp._src.collision_primitive_core import (
@@ -35,12 +35,14 @@ __all__ = [
 ]  # fmt: skip
 
 # Large functions with many callers: inlined, they made kernels of contacts with flexes, of which we
-# need neither interpolated ones nor boxes of rods, take a minute to compile on CUDA.
+# need neither interpolated ones nor boxes of rods, and of convex geoms take a minute or two to
+# compile on CUDA.
 for _each in (
   support.add_flex_interp_weights, support.contact_bodies_and_weights,
   collision_flex._collide_geom_box_rod_detect, collision_flex._collide_geom_capsule_detect,
   collision_flex._collide_geom_triangle_detect, collision_flex._collide_mesh_convex,
-  collision_flex._write_candidate,
+  collision_flex._write_candidate, collision_gjk._epa, collision_gjk.ccd, collision_gjk.gjk,
+  collision_gjk.multicontact, collision_gjk.support,
 ):  # fmt: skip
   _each.inline_hint = "noinline"
 

@@ -118,8 +118,9 @@ class Host(host.Host):
     return getattr(self._batch.d, name).numpy().astype(float)
 
   def load(self, kernel: Twin):
-    """See `Host`."""
-    kernel.many.load(self.device, _BLOCK)
+    """See `Host`; on CUDA all of a step are compiled at once, see `compile_ahead`."""
+    if not self.device.is_cuda:
+      kernel.many.load(self.device, _BLOCK)
 
   def launch(self, kernel: Twin, fields: Any, count: int = 0, arg: int = 0):
     """See `Host`."""

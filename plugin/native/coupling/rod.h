@@ -292,7 +292,7 @@ PALPATE void begin(const Host& host, double h) {
     assemble(rod, rod.place.data, rod.turn.data, h, rod.gradient.data, false);
     hold(rod, rod.gradient.data, H);
     factorize_nodes(rod);
-    one_lane([&] { invert_there(H, inverse_of(rod), rod.below.data, rod.ranked.data); });
+    invert_there(H, inverse_of(rod), rod.below.data, rod.ranked.data);
   }
   each_lane(0, rod.nnode, [&](int i) {
     if (!host.moves(i)) return;

@@ -2,6 +2,7 @@
 // doi:10.1093/comjnl/9.3.281): a direct solve, and the part of the inverse that lies in there.
 #pragma once
 #include "core/d3.h"
+#include "core/lanes.h"
 
 AS_WRITTEN
 
@@ -48,6 +49,98 @@ PALPATE double dot_of(const double* a, const double* b, int n) {
 // first column and are taken together. `u` is scratch, ROWS n long. Returns whether A is positive definite, and
 // stops where it is not.
 template <int ROWS>
+PALPATE bool factorize(const Envelope& A, double* u);
+
+// A^-1 b in place of b, from the factors.
+CALLED void solve_factorized(const Envelope& L, double* b);
+
+// The entries of A^-1 there, from the factors (Erisman and Tinney 1975, doi:10.1145/360680.360704). `below` and `u`
+// are scratch, n and 2 n long.
+PALPATE void invert_there(const Envelope& L, const Envelope& Z, int* below, double* u);
+
+#if ON_CUDA
+
+// L^-1 u in place of u, ROWS times, from column `lo`, before which it is 0, to `hi`. A lane has a column of every
+// TOGETHER.
+template <int ROWS>
+PALPATE void substitute(const Envelope& L, int lo, int hi, double* u) {
+  for (int from = lo; from < hi; from += TOGETHER) {
+    const int j = from + own_lane(), end = from + TOGETHER < hi ? from + TOGETHER : hi;
+    const int first = j < hi ? L.first[j] : end;
+    const double* row = j < hi ? L.row(j) : nullptr;
+    double own[ROWS];
+    for (int r = 0; r < ROWS; ++r) own[r] = j < hi ? u[r * L.n + j] : 0.0;
+    for (int k = first > lo ? first : lo; k < from; ++k)
+      for (int r = 0; r < ROWS; ++r) own[r] -= u[r * L.n + k] * row[k];
+    __syncwarp();
+    for (int k = from; k < end; ++k) {
+      const double l = k >= first && k < j ? row[k] : 0.0;
+      for (int r = 0; r < ROWS; ++r) own[r] -= __shfl_sync(0xffffffffu, own[r], k - from) * l;
+    }
+    for (int r = 0; r < ROWS && j < hi; ++r) u[r * L.n + j] = own[r];
+    meet_lanes();
+  }
+}
+
+template <int ROWS>
+PALPATE bool factorize(const Envelope& A, double* u) {
+  for (int i = 0; i < A.n; i += ROWS) {
+    const int lo = A.first[i];
+    each_lane(lo, i, [&](int j) {
+      for (int r = 0; r < ROWS; ++r) u[r * A.n + j] = A.row(i + r)[j];
+    });
+    substitute<ROWS>(A, lo, i, u);  // u = L D of the rows
+    for (int r = 0; r < ROWS; ++r) {
+      double *row = A.row(i + r), *own = u + r * A.n, pivot = 0.0;
+      for (int j = i; j < i + r; ++j) {
+        double sum = 0.0;
+        each_lane(lo, j, [&](int k) { sum += own[k] * A.row(j)[k]; });
+        sum = sum_together(sum);
+        one_lane([&] { own[j] = row[j] - sum; });
+      }
+      each_lane(lo, i + r, [&](int j) {
+        row[j] = own[j] * A.row(j)[j];
+        pivot += row[j] * own[j];
+      });
+      const double whole = row[i + r], rest = whole - sum_together(pivot);
+      if (!(rest > 1e-12 * whole)) return false;
+      one_lane([&] { row[i + r] = 1.0 / rest; });
+    }
+  }
+  return true;
+}
+
+CALLED void solve_factorized(const Envelope& L, double* b) {
+  substitute<1>(L, 0, L.n, b);
+  each_lane(0, L.n, [&](int i) { b[i] *= L.row(i)[i]; });
+  for (int i = L.n - 1; i >= 0; --i) {
+    const double* row = L.row(i);
+    each_lane(L.first[i], i, [&](int k) { b[k] -= row[k] * b[i]; });
+  }
+}
+
+PALPATE void invert_there(const Envelope& L, const Envelope& Z, int*, double* column) {
+  int last = L.n - 1;  // row that has column i
+  for (int i = L.n - 1; i >= 0; --i) {
+    while (L.first[last] > i) --last;
+    each_lane(i + 1, last + 1, [&](int k) { column[k] = L.first[k] <= i ? L.row(k)[i] : 0.0; });
+    double sum = 0.0;
+    each_lane(i + 1, last + 1, [&](int k) {
+      if (L.first[k] > i) return;
+      double product = 0.0;
+      for (int m = i + 1; m <= last; ++m)
+        if (column[m] != 0.0) product += Z.at(k, m) * column[m];
+      Z.at(k, i) = -product;
+      sum += column[k] * product;
+    });
+    sum = sum_together(sum);
+    one_lane([&] { Z.at(i, i) = L.row(i)[i] + sum; });
+  }
+}
+
+#else
+
+template <int ROWS>
 PALPATE bool factorize(const Envelope& A, double* u) {
   for (int i = 0; i < A.n; i += ROWS) {
     const int lo = A.first[i];
@@ -81,7 +174,6 @@ PALPATE bool factorize(const Envelope& A, double* u) {
   return true;
 }
 
-// A^-1 b in place of b, from the factors.
 CALLED void solve_factorized(const Envelope& L, double* b) {
   for (int i = 0; i < L.n; ++i) {
     const int lo = L.first[i];
@@ -94,8 +186,6 @@ CALLED void solve_factorized(const Envelope& L, double* b) {
   }
 }
 
-// The entries of A^-1 there, from the factors (Erisman and Tinney 1975, doi:10.1145/360680.360704). `below` and `u`
-// are scratch, n and 2 n long.
 PALPATE void invert_there(const Envelope& L, const Envelope& Z, int* below, double* u) {
   double *column = u, *product = u + L.n;  // of L, and of Z with it
   int count = 0;  // rows after i that have column i, the last one first
@@ -122,5 +212,7 @@ PALPATE void invert_there(const Envelope& L, const Envelope& Z, int* below, doub
     below[count++] = i;
   }
 }
+
+#endif
 
 }  // namespace palpate

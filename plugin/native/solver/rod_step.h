@@ -226,9 +226,7 @@ PALPATE void hold(const Fields& f, double* g, const RodMatrix& H) {
 template <class Fields>
 PALPATE bool factorize_nodes(const Fields& f) {
   const RodMatrix H = matrix_of(f);
-  double found = 0.0;
-  one_lane([&] { found = f.twists ? factorize<4>(H, f.ranked.data) : factorize<3>(H, f.ranked.data); });
-  return sum_together(found) > 0.0;
+  return f.twists ? factorize<4>(H, f.ranked.data) : factorize<3>(H, f.ranked.data);
 }
 
 // A^-1 b in place of b, four numbers a node, from the factors.
@@ -239,7 +237,7 @@ PALPATE void solve_nodes(const Fields& f, double* b) {
   each_lane(0, nodes_of(f), [&](int i) {
     for (int c = 0; c < H.per; ++c) y[H.of(i, c)] = b[4 * i + c];
   });
-  one_lane([&] { solve_factorized(H, y); });
+  solve_factorized(H, y);
   each_lane(0, nodes_of(f), [&](int i) {
     for (int c = 0; c < 4; ++c) b[4 * i + c] = c < H.per ? y[H.of(i, c)] : 0.0;
   });
