@@ -118,17 +118,6 @@ def test_a_needle_swings_on_its_thread(device):
 
 @SLOW
 @pytest.mark.parametrize("device", DEVICES)
-def test_jaws_close_on_a_thread_and_come_to_rest(device):
-  model, data, thread, worlds = scene(one.pinch(1e-3), device)
-  run(model, data, worlds, 50, lambda k: 2.0)
-  for _ in range(10):
-    run(model, data, worlds, 5, lambda k: 2.0)
-    assert np.abs(worlds.qvel.numpy()).max() < 1e-3
-  assert off(thread, worlds) < 1e-8
-
-
-@SLOW
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_held_thread_does_not_meet_the_jaws_that_it_is_in(device):
   model, data, thread, worlds = scene(one.hand(), device)
   run(model, data, worlds, 10, one.shake)
