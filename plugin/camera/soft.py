@@ -2,7 +2,7 @@
 
 A skin is the smooth surface through the organ's vertices. Without one, or once cuts have changed
 the triangles, the organ's own surface is drawn, a flex's radius outside, as MuJoCo draws a flex; a
-sheet has two sides.
+sheet has two sides, and so has a closed one that can be cut open.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class Surface:
     one = csr_array(eye_array(count))
     front = Sheet(self._rest[:count], one, coord, radius, thing)
     self._sheets.append(front)
-    self._flat = not mesh.closed and not len(mesh.tet)
+    self._flat = not len(mesh.tet) and (not mesh.closed or mesh.spare > 0)
     if self._flat:
       rim = np.flatnonzero(mesh.twin < 0)
       edge = np.repeat(coord.reshape(-1, 2)[rim][:, None], 3, axis=1)
