@@ -19,8 +19,8 @@ from PIL import Image
 
 ORGAN = "gallbladder/gallbladder"
 LENGTH, DIAMETER = 0.016, 3.5e-4  # of the needle [m]
-THREAD, EDGE = 0.1, 1.5e-3  # lengths of the thread, and of its edges [m]
-RADIUS = LENGTH / np.pi  # of the needle's circle [m]
+RADIUS = LENGTH / np.pi  # of its circle [m]
+THREAD, EDGE = 0.1, 1e-3  # lengths of the thread, and of its edges [m]
 HALF, BITE, PITCH = 0.009, 0.004, 0.005  # half of the cut; of stitches, from it and between [m]
 STITCHES = 3
 OPEN, MORE = 0.4, 0.8  # what the stay sutures pull with, and later [N]
@@ -38,24 +38,21 @@ def scene() -> mujoco.MjModel:
   plugin.config = plugin.config | {"needles": "needle 400 10"}
   palpate.add_spare(spec, ORGAN, 60)
   apart = np.array([0, 0, 0.15])  # until the cut is made
-  spec.worldbody.add_body(name="hand_to", mocap=True, pos=apart)
+  spec.worldbody.add_body(name="hand", mocap=True, pos=apart)
   nodes = apart - [(0, RADIUS + EDGE * k, 0) for k in range(round(THREAD / EDGE) + 1)]
   nothing = {"contype": 0, "conaffinity": 0}
   palpate.add_thread(spec, nodes, "suture", strength=0, bead=CLIP, contact=nothing)
-  hand = spec.worldbody.add_body(name="hand", pos=apart)
-  hand.add_freejoint(name="hand")
-  hand.add_geom(size=[0.002] * 3, mass=0.1, contype=0, conaffinity=0, rgba=[0] * 4)
-  palpate.add_needle(spec, length=LENGTH, diameter=DIAMETER, parent="hand", thread="suture")
+  palpate.add_needle(spec, length=LENGTH, diameter=DIAMETER, pos=apart, thread="suture")
   clip = spec.worldbody.add_body(name="clip", pos=-apart)
   clip.add_freejoint(name="clip").damping = [0.3, 0, 0]  # [N s/m]
   clip.add_geom(size=[CLIP, 0, 0], mass=1e-3, rgba=spec.flex("suture").rgba)
-  firm = {"objtype": mujoco.mjtObj.mjOBJ_BODY, "solref": [0.004, 1]}
-  firm["solimp"] = [0.999, 0.9999, 1e-3, 0.5, 2]
-  weld, connect = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT
-  turn = [0] * 6 + [1, 0, 0, 0, 1, 0]
-  spec.add_equality(type=weld, name1="hand_to", name2="hand", data=turn, **firm)
-  name = "clip"
-  spec.add_equality(name=name, type=connect, name1=name, name2="suture_0", active=False, **firm)
+  eq = mujoco.mjtEq
+  for kind, one, other in ((eq.mjEQ_WELD, "hand", "needle"), (eq.mjEQ_CONNECT, "clip", "suture_0")):
+    spec.add_equality(
+      name=one, type=kind, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=one, name2=other,
+      active=one == "hand", solref=[0.004, 1], solimp=[0.999, 0.9999, 1e-3, 0.5, 2],
+      data=[0] * 6 + [1, 0, 0, 0, 1, 0],
+    )  # fmt: skip
   spec.visual.global_.offwidth, spec.visual.global_.offheight = SIZE
   return spec.compile()
 
@@ -159,7 +156,7 @@ class Surgery:
     circle = self._circle(0)
     pos, quat = self._pose(circle, -circle[2] - AHEAD, ABOVE)
     self._hold(pos, quat)
-    self.data.joint("hand").qpos[:] = np.concatenate([pos, quat])
+    self.data.joint("needle").qpos[:] = np.concatenate([pos, quat])
     mujoco.mj_forward(self.model, self.data)
     swage = self.data.site("needle_swage").xpos
     self.thread.lay(np.array([swage, swage + self.frame @ (0, 0.25, 0.5)]))
