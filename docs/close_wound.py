@@ -2,9 +2,10 @@
 
 python docs/close_wound.py
 
-Stay sutures pull at both sides of the cut. A hand drives a needle through both lips three times,
-and pulls its thread, which ends in a bead, until the cut is closed. The lips do not touch each
-other: they may overlap where the thread pulls more than the wall does.
+Stay sutures pull at both sides of the cut. A hand drives a needle through both lips three times and
+pulls its thread, which ends in a bead, until the cut is closed. A clip on the thread, over the last
+hole, ends the suture, and the hand lets go. The lips do not touch each other: they may overlap
+where the thread pulls more than the wall does.
 """
 
 import pathlib
@@ -16,16 +17,17 @@ import trimesh
 from palpate import models
 from PIL import Image
 
-ORGAN, STEP = "gallbladder/gallbladder", 1e-3  # [s]
-LENGTH, EDGE, THREAD = 0.016, 1.5e-3, 0.1  # of the needle, and of the thread and its edges [m]
-RADIUS = LENGTH / np.pi  # of the needle's circle [m]
+ORGAN = "gallbladder/gallbladder"
+LENGTH, DIAMETER = 0.016, 3.5e-4  # of the needle [m]
+RADIUS = LENGTH / np.pi  # of its circle [m]
+THREAD, EDGE = 0.1, 1e-3  # lengths of the thread, and of its edges [m]
 HALF, BITE, PITCH = 0.009, 0.004, 0.005  # half of the cut; of stitches, from it and between [m]
 STITCHES = 3
 OPEN, MORE = 0.4, 0.8  # what the stay sutures pull with, and later [N]
 PULL, CLOSED = 0.6, 4e-4  # of the thread [N]; gap at which it is closed enough [m]
-TURN, MOVE, DRAW, SLOW = 6.0, 0.1, 0.12, 0.01  # of the hand [rad/s, m/s]
+TURN, MOVE, DRAW, SLOW = 6e-3, 1e-4, 1.2e-4, 1e-5  # of the hand in a step [rad, m]
 AHEAD, ABOVE = 0.3, 0.015  # of the needle's way before it is in the wall [rad, m]
-APART = 0.15  # height of the hand at first [m]
+CLIP = 1.2e-3  # radius of the bead and of the clip [m]
 SIZE = 640, 640  # of each picture
 
 
@@ -35,20 +37,32 @@ def scene() -> mujoco.MjModel:
   (plugin,) = spec.plugins
   plugin.config = plugin.config | {"needles": "needle 400 10"}
   palpate.add_spare(spec, ORGAN, 60)
-  spec.worldbody.add_body(name="hand_to", mocap=True, pos=(0, 0, APART))
-  hand = spec.worldbody.add_body(name="hand", pos=(0, 0, APART))
-  hand.add_freejoint(name="hand")
-  hand.add_geom(size=[0.002] * 3, mass=0.1, contype=0, conaffinity=0, rgba=[0] * 4)
-  spec.add_equality(
-    type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="hand_to", name2="hand",
-    data=[0] * 6 + [1, 0, 0, 0, 1, 0], solref=[0.004, 1], solimp=[0.999, 0.9999, 0.001, 0.5, 2],
-  )  # fmt: skip
-  nodes = [(0, -RADIUS - EDGE * k, APART) for k in range(round(THREAD / EDGE) + 1)]
-  meets = {"contype": 0, "conaffinity": 0}
-  palpate.add_thread(spec, nodes, "suture", strength=0, bead=1e-3, contact=meets)
-  palpate.add_needle(spec, length=LENGTH, diameter=5e-4, parent="hand", thread="suture")
+  apart = np.array([0, 0, 0.15])  # until the cut is made
+  spec.worldbody.add_body(name="hand", mocap=True, pos=apart)
+  nodes = apart - [(0, RADIUS + EDGE * k, 0) for k in range(round(THREAD / EDGE) + 1)]
+  nothing = {"contype": 0, "conaffinity": 0}
+  palpate.add_thread(spec, nodes, "suture", strength=0, bead=CLIP, contact=nothing)
+  palpate.add_needle(spec, length=LENGTH, diameter=DIAMETER, pos=apart, thread="suture")
+  clip = spec.worldbody.add_body(name="clip", pos=-apart)
+  clip.add_freejoint(name="clip").damping = [0.3, 0, 0]  # [N s/m]
+  clip.add_geom(size=[CLIP, 0, 0], mass=1e-3, rgba=spec.flex("suture").rgba)
+  eq = mujoco.mjtEq
+  for kind, one, other in ((eq.mjEQ_WELD, "hand", "needle"), (eq.mjEQ_CONNECT, "clip", "suture_0")):
+    spec.add_equality(
+      name=one, type=kind, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=one, name2=other,
+      active=one == "hand", solref=[0.004, 1], solimp=[0.999, 0.9999, 1e-3, 0.5, 2],
+      data=[0] * 6 + [1, 0, 0, 0, 1, 0],
+    )  # fmt: skip
   spec.visual.global_.offwidth, spec.visual.global_.offheight = SIZE
   return spec.compile()
+
+
+def on(organ: palpate.Organ, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Returns the places [m] on a surface at rest nearest to points, their triangles and shares."""
+  used = np.isfinite(organ.xpos0).all(axis=1)
+  surface = trimesh.Trimesh(np.where(used[:, None], organ.xpos0, 1.0), organ.elem, process=False)
+  at, _, seat = trimesh.proximity.closest_point_naive(surface, points)
+  return at, seat, trimesh.triangles.points_to_barycentric(surface.triangles[seat], at)
 
 
 class Surgery:
@@ -61,45 +75,31 @@ class Surgery:
   """
 
   def __init__(self):
-    self.model = scene()
-    self.data = data = mujoco.MjData(self.model)
-    mujoco.mj_forward(self.model, data)
-    self.organ = palpate.Organ(self.model, data, ORGAN)
-    self.thread = palpate.Thread(self.model, data, "suture")
-    at, top, end = (
+    self.model = model = scene()
+    self.data = data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    self.organ = organ = palpate.Organ(model, data, ORGAN)
+    self.thread = palpate.Thread(model, data, "suture")
+    body, top, end = (
       data.site(f"{ORGAN}_{place}").xpos for place in ("body", "fundus", "infundibulum")
     )
-    surface = self._surface(self.organ.xpos)
-    (self.middle,), _, (near,) = trimesh.proximity.closest_point_naive(surface, at[None])
-    out = surface.face_normals[near]
-    along = top - end - (top - end) @ out * out
-    along /= np.linalg.norm(along)
+    (self.middle,), (near,), _ = on(organ, body[None])
+    a, b, c = organ.xpos0[organ.elem[near]]
+    out = _unit(np.cross(b - a, c - a))
+    along = _unit(top - end - (top - end) @ out * out)
     self.frame = np.column_stack([along, np.cross(out, along), out])
-    line = self.middle + np.linspace(-HALF, HALF, 20)[:, None] * along
-    self.organ.cut(trimesh.proximity.closest_point_naive(surface, line)[0])
-    self._look()
-
-  def _surface(self, x: np.ndarray) -> trimesh.Trimesh:
-    """Returns the surface with vertices at places (nvert, 3) [m]; spare ones have none."""
-    return trimesh.Trimesh(np.where(np.isfinite(x), x, 1.0), self.organ.elem, process=False)
-
-  def _look(self):
-    """Finds both lips, where stay sutures pull, and the marks of the stitches."""
-    rest, elem = self.organ.xpos0, self.organ.elem
-    place = (rest - self.middle) @ self.frame
-    middle = place[elem].mean(axis=1)
-    same = np.linalg.norm(rest[:, None] - rest, axis=2) < 1e-9
-    pairs = np.argwhere(np.triu(same, 1))
-    side = [[middle[(elem == v).any(axis=1), 1].mean() for v in pair] for pair in pairs]
+    organ.cut(on(organ, self.middle + np.linspace(-HALF, HALF, 20)[:, None] * along)[0])
+    # Both lips, where stay sutures pull, and the marks of the stitches.
+    place = (organ.xpos0 - self.middle) @ self.frame
+    pairs = np.argwhere(np.triu(np.linalg.norm(place[:, None] - place, axis=2) < 1e-9, 1))
+    side = [[place[organ.elem[(organ.elem == v).any(axis=1)], 1].mean() for v in p] for p in pairs]
     self.lips = np.take_along_axis(pairs, np.argsort(side, axis=1), axis=1)  # -y, +y
-    near = (np.abs(place[:, 0]) < HALF) & (np.abs(place[:, 2]) < 0.008)
-    far = (np.abs(place[:, 1]) > 0.0075) & (np.abs(place[:, 1]) < 0.0115)
-    self.stays = [np.flatnonzero(near & far & (s * place[:, 1] > 0)) for s in (-1, 1)]
+    near = (np.abs(place[:, [0, 2]]) < (HALF, 0.008)).all(axis=1)
+    near &= np.abs(np.abs(place[:, 1]) - 0.0095) < 0.002
+    self.stays = [np.flatnonzero(near & (sign * place[:, 1] > 0)) for sign in (-1, 1)]
     rows = PITCH * (np.arange(STITCHES) - (STITCHES - 1) / 2)
-    marks = np.array([(row, s * BITE, 0.0) for row in rows for s in (1, -1)]) @ self.frame.T
-    surface = self._surface(rest)
-    at, _, self.seat = trimesh.proximity.closest_point_naive(surface, self.middle + marks)
-    self.share = trimesh.triangles.points_to_barycentric(surface.triangles[self.seat], at)
+    marks = np.array([(row, sign * BITE, 0.0) for row in rows for sign in (1, -1)])
+    _, self.seat, self.share = on(organ, self.middle + marks @ self.frame.T)
 
   @property
   def gaps(self) -> np.ndarray:
@@ -118,71 +118,80 @@ class Surgery:
     """Takes steps."""
     mujoco.mj_step(self.model, self.data, steps)
 
-  def _ends(self, stitch: int) -> np.ndarray:
-    """Returns where the two marks of a stitch are now [m]  (2, 3)."""
-    x = self.organ.xpos[self.organ.elem[self.seat]]
-    return (self.share[:, None] @ x)[2 * stitch : 2 * stitch + 2, 0]
+  def _circle(self, stitch: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Returns a needle's circle through the marks of a stitch now.
 
-  def _pose(self, ends: np.ndarray, tip: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the needle's circle through two marks, by the angle of its tip from the bottom."""
-    way, out = ends[1] - ends[0], self.frame[:, 2]
-    way /= np.linalg.norm(way)
-    up = out - out @ way * way
-    up /= np.linalg.norm(up)
-    height = RADIUS * np.cos(self._half(ends))
-    x = -np.sin(tip) * up - np.cos(tip) * way
-    axis, quat = np.cross(way, up), np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.column_stack([x, np.cross(axis, x), axis]).ravel())
-    return ends.mean(axis=0) + height * up, quat
+    Its middle [m], its axes (across, up and its own as columns), and half of the angle between the
+    marks [rad].
+    """
+    x = (self.share[:, None] @ self.organ.xpos[self.organ.elem[self.seat]])[2 * stitch :, 0]
+    half = np.arcsin(min(0.5 * np.linalg.norm(x[1] - x[0]) / RADIUS, 0.9))
+    way, out = _unit(x[1] - x[0]), self.frame[:, 2]
+    up = _unit(out - out @ way * way)
+    axes = np.column_stack([way, up, np.cross(way, up)])
+    return 0.5 * (x[0] + x[1]) + RADIUS * np.cos(half) * up, axes, half
 
-  def _half(self, ends: np.ndarray) -> float:
-    """Returns half of the angle between two marks on the needle's circle [rad]."""
-    return float(np.arcsin(min(0.5 * np.linalg.norm(ends[1] - ends[0]) / RADIUS, 0.9)))
+  def _pose(self, circle, tip: float, high: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Returns place and turn of a needle on a circle, by the angle of its tip from the bottom."""
+    middle, axes, _ = circle
+    c, s, quat = np.cos(tip), np.sin(tip), np.zeros(4)
+    mujoco.mju_mat2Quat(quat, (axes @ [[-c, s, 0], [-s, -c, 0], [0, 0, 1]]).ravel())
+    return middle + high * self.frame[:, 2], quat
+
+  def _hold(self, pos: np.ndarray, quat: np.ndarray):
+    """Puts the hand somewhere."""
+    self.data.mocap_pos[0], self.data.mocap_quat[0] = pos, quat  # MuJoCo makes it a unit
 
   def _move(self, pos: np.ndarray, quat: np.ndarray):
-    """Moves the hand to a pose in a line."""
-    target = self.model.body("hand_to").mocapid[0]
-    start, first = self.data.mocap_pos[target].copy(), self.data.mocap_quat[target].copy()
+    """Moves the hand somewhere in a line."""
+    start, first = self.data.mocap_pos[0].copy(), self.data.mocap_quat[0].copy()
     quat = quat * (1 if quat @ first > 0 else -1)
-    turned = 2 * np.arccos(min(1.0, quat @ first)) / TURN
-    steps = max(1, round(max(np.linalg.norm(pos - start) / MOVE, turned) / STEP))
-    for k in range(steps):
-      share = (k + 1) / steps
-      self.data.mocap_pos[target] = start + share * (pos - start)
-      self.data.mocap_quat[target] = first + share * (quat - first)  # MuJoCo makes it a unit
+    turned = 2 * np.arccos(min(1.0, quat @ first))
+    for share in np.linspace(0, 1, 1 + int(max(np.linalg.norm(pos - start) / MOVE, turned / TURN))):
+      self._hold(start + share * (pos - start), first + share * (quat - first))
       self.wait(1)
 
   def take_needle(self):
     """Puts the needle over the first stitch, its thread straight behind it."""
-    target, ends = self.model.body("hand_to").mocapid[0], self._ends(0)
-    pos, quat = self._pose(ends, -self._half(ends) - AHEAD)
-    pos = pos + ABOVE * self.frame[:, 2]
-    self.data.mocap_pos[target], self.data.mocap_quat[target] = pos, quat
-    self.data.joint("hand").qpos[:] = np.concatenate([pos, quat])
+    circle = self._circle(0)
+    pos, quat = self._pose(circle, -circle[2] - AHEAD, ABOVE)
+    self._hold(pos, quat)
+    self.data.joint("needle").qpos[:] = np.concatenate([pos, quat])
     mujoco.mj_forward(self.model, self.data)
     swage = self.data.site("needle_swage").xpos
     self.thread.lay(np.array([swage, swage + self.frame @ (0, 0.25, 0.5)]))
 
   def drive(self, stitch: int):
     """Drives the needle down through one lip, up through the other one, and out."""
-    ends = self._ends(stitch)
-    pos, quat = self._pose(ends, -self._half(ends) - AHEAD)
-    self._move(pos + ABOVE * self.frame[:, 2], quat)
-    self._move(pos, quat)
-    ends, target = self._ends(stitch), self.model.body("hand_to").mocapid[0]
-    half = self._half(ends)
-    for tip in np.arange(-half - AHEAD, half + np.pi + 0.5, TURN * STEP):
-      self.data.mocap_pos[target], self.data.mocap_quat[target] = self._pose(ends, tip)
+    for high in (ABOVE, 0.0):
+      circle = self._circle(stitch)
+      self._move(*self._pose(circle, -circle[2] - AHEAD, high))
+    circle = self._circle(stitch)
+    for tip in np.arange(-circle[2] - AHEAD, circle[2] + np.pi + 0.5, TURN):
+      self._hold(*self._pose(circle, tip))
       self.wait(1)
 
   def pull(self):
     """Draws the thread through, until it pulls or the cut is closed."""
-    way, target = self.frame @ (0.5, -0.3, 0.8), self.model.body("hand_to").mocapid[0]
     tight = 0.0
     while tight < PULL and self.gaps.max() > CLOSED:
       tight = self.thread.tension[:8].max()
-      self.data.mocap_pos[target] += (DRAW if tight < 0.4 * PULL else SLOW) * STEP * way
+      step = DRAW if tight < 0.4 * PULL else SLOW
+      self.data.mocap_pos[0] += step * self.frame @ (0.5, -0.3, 0.8)
       self.wait(1)
+
+  def clip(self):
+    """Puts a clip on the thread where it leaves the wall, and cuts the needle off."""
+    data, clip, swage = self.data, self.model.equality("clip"), self.model.equality("needle_suture")
+    node = int((-self.organ.pinholes[-1].along - 2 * CLIP) / EDGE)
+    data.joint("clip").qpos[:3] = self.thread.positions[node]
+    clip.obj2id, clip.data[:6] = self.model.body(f"suture_{node}").id, 0
+    data.eq_active[[clip.id, swage.id]] = 1, 0
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+  """Returns a vector of length 1."""
+  return vector / np.linalg.norm(vector)
 
 
 def main():
@@ -208,6 +217,8 @@ def main():
       if stitch == 0:
         draw()
       surgery.pull()
+    surgery.clip()
+    surgery.wait(500)
     draw()
     surgery.stay(MORE)
     surgery.wait(300)

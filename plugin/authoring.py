@@ -81,7 +81,7 @@ def add_organ(
   where = parent_of(spec, name, parent)
   check_names(spec, name, 0 if windowed else surface.nvert)
   body = where.add_body(name=name, pos=pos, quat=quat)
-  texts |= spares.add_walls(spec, body, name, surface, config, radius)
+  texts |= spares.add_walls(spec, body, name, surface, config)
   if windowed:
     return _add_windowed(spec, body, surface, pins, mass, texts, look, options)
   return _add_nodal(spec, body, surface, pins, mass, texts, look)

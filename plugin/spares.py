@@ -9,13 +9,13 @@ import mujoco
 import numpy as np
 
 from .engine import plugin as engine
-from .engine.layout import LIPS, WALLS
+from .engine.cutting.walls import room
 from .tissue.geometry import mesh as topology
 from .windows import add_node, find_organ, make_flex, rest_of
 
-_INSIDE = (0.5, 0.13, 0.12, 1.0)  # colour of the walls of cuts in a solid, dark on a sheet's lips
-_LIPS = (0.22, 0.03, 0.03, 1.0)
-_THIN = 1e-4  # radius of the flex that draws them, on a sheet beyond its own [m]
+_INSIDE = (0.5, 0.13, 0.12, 1.0)  # colour of the walls of cuts in a solid
+_LIPS = (0.36, 0.05, 0.045, 1.0)  # of cuts in a sheet
+_THIN = 1e-5  # radius of the flex that draws them [m]
 _CUTS = 8  # times the square root of its vertices is what "auto" gives an organ
 _THROUGH = 4  # times their number to the power of 2/3 is what it gives a solid
 
@@ -57,10 +57,10 @@ def add_spare(spec: mujoco.MjSpec, organ: str, spare: int):
   above = own[0].parent if own else bodies[vertbody[0]]
   elem = np.reshape(flex.elem, (-1, 3))
   surface = topology.build(organ, np.concatenate([rest, more + middle]), elem, spare)
-  plugin.config = config | add_walls(spec, above, organ, surface, config, flex.radius)
+  plugin.config = config | add_walls(spec, above, organ, surface, config)
 
 
-def add_walls(spec, body, organ: str, surface, config: Mapping, radius: float) -> dict[str, str]:
+def add_walls(spec, body, organ: str, surface, config: Mapping) -> dict[str, str]:
   """Adds the flex that draws what cuts open, see `Walls`, to an organ with room for cuts.
 
   Args:
@@ -69,7 +69,6 @@ def add_walls(spec, body, organ: str, surface, config: Mapping, radius: float) -
     organ: its name
     surface: it, with its spare vertices
     config: its configuration
-    radius: of its flex [m]
 
   Returns:
     what the configuration has of it
@@ -81,13 +80,13 @@ def add_walls(spec, body, organ: str, surface, config: Mapping, radius: float) -
   if spec.flex(name) is not None:
     raise ValueError(f"organ {organ!r}: the spec has a flex {name!r} already")
   body.add_body(name=name)
-  count, room = (surface.nvert, WALLS) if solid else (4 * LIPS * surface.spare, 2 * LIPS)
-  elem = np.tile([0, 1, 2], (room * surface.spare, 1))  # others when there are some
+  count, triangles = room(surface.nvert, surface.spare, solid)
+  elem = np.tile([0, 1, 2], (triangles, 1))  # others when there are some
   rgba = np.array(_INSIDE if solid else _LIPS)
   flex = make_flex(spec, name, np.zeros((count, 3)), [name] * count, elem, rgba=rgba)
   flex.contype = flex.conaffinity = 0
   flex.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
-  flex.radius, flex.edgedamping = _THIN + (0.0 if solid else radius), 0.0
+  flex.radius, flex.edgedamping = _THIN, 0.0
   return {"walls": name}
 
 

@@ -2,7 +2,7 @@
 
 A skin is the smooth surface through the organ's vertices. Without one, or once cuts have changed
 the triangles, the organ's own surface is drawn, a flex's radius outside, as MuJoCo draws a flex; a
-sheet has two sides.
+sheet has two sides, and so has a closed one that can be cut open.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.engine import layout
+from palpate.engine.cutting.walls import opened
 from palpate.engine.model import flexes, mjstruct
 from palpate.engine.model.skin import Skin
 from palpate.tissue.geometry import subdivide
-from palpate.tissue.geometry.mesh import Mesh, vertex_normals
+from palpate.tissue.geometry.mesh import Mesh, corners, vertex_normals
 from palpate.tissue.types import fill
 from scipy.sparse import csr_array, eye_array
 
@@ -53,8 +55,8 @@ class Surface:
   """An organ's surface in the rows of a camera.
 
   Its triangles are those of a skin, then those of the organ's own surface: its front, of a sheet
-  its back and the rim between them, of a solid room for the walls of cuts. Those that are not drawn
-  have no area.
+  its back and the rim between them; and room for the walls of cuts. Those that are not drawn have
+  no area.
 
   Args:
     tissue: the organ in a batch
@@ -97,7 +99,7 @@ class Surface:
     self.coord = np.pad(np.concatenate(coord), ((0, 0), (0, 0), (0, 1)))
     self.flat = np.arange(len(self.face)) >= len(self.face) - self._walls
     self.thing[self.flat] = lip
-    self.lip = np.where(self.flat | (len(organ.mesh.tet) > 0), -1, lip)
+    self.lip = np.where(self.flat, -1, lip)
 
   def _add_skin(self, model: mujoco.MjModel, scene: Scene, made: Skin, detail: int):
     """Adds the organ's skin, or the same with fewer triangles."""
@@ -134,7 +136,7 @@ class Surface:
     one = csr_array(eye_array(count))
     front = Sheet(self._rest[:count], one, coord, radius, thing)
     self._sheets.append(front)
-    self._flat = not mesh.closed and not len(mesh.tet)
+    self._flat = not len(mesh.tet) and (not mesh.closed or mesh.spare > 0)
     if self._flat:
       rim = np.flatnonzero(mesh.twin < 0)
       edge = np.repeat(coord.reshape(-1, 2)[rim][:, None], 3, axis=1)
@@ -148,8 +150,9 @@ class Surface:
     flex = flexes.find(m, "flex", walls, organ.name) if walls else -1
     if flex < 0:
       return -1
-    if len(organ.mesh.tet):
-      self._walls = len(flexes.element_data(m, flex))
+    if len(organ.mesh.tet) or self._flat:
+      each = layout.WALLS if len(organ.mesh.tet) else 2 * layout.LIPS
+      self._walls = each * organ.mesh.spare
       room = np.zeros((self._walls, 3, 2))
       own = self._sheets[-1]
       own.texcoord = np.concatenate([own.texcoord, room])
@@ -163,18 +166,15 @@ class Surface:
       return fine
     cut = mesh is not whole and not both
     elem = mesh.elem[: whole.nelem] if mesh.spare else self._own
-    parts = [fine * (not cut), elem + first]
+    parts, walls = [fine * (not cut), elem + first], mesh.elem[whole.nelem :]
     if self._flat:
-      count, rim = mesh.nskin, np.flatnonzero(whole.twin < 0)
-      a, b = elem.ravel()[rim], elem[rim // 3, (rim + 1) % 3]
-      sides = [elem[:, [0, 2, 1]] + count]
-      sides += [np.stack([b, a, a + count], 1), np.stack([b, a + count, b + count], 1)]
-      parts += [side + first for side in sides]
+      parts.append(elem[:, [0, 2, 1]] + mesh.nskin + first)
+      parts.append(_rim(mesh, np.flatnonzero(whole.twin < 0)) + first)
+      walls = _rim(mesh, opened(mesh))
     if self._walls:
-      walls = np.zeros((self._walls, 3), int)
-      opened = mesh.elem[whole.nelem :][: self._walls]
-      walls[: len(opened)] = opened + first
-      parts.append(walls)
+      room = np.zeros((self._walls, 3), int)
+      room[: len(walls)] = walls[: self._walls] + first
+      parts.append(room)
     if len(fine) and not cut and not both:
       parts[1:] = [0 * part for part in parts[1:]]
     return np.concatenate(parts)
@@ -244,16 +244,15 @@ class Surface:
     smooth = self._smooth & (face != face[:, :1]).any(axis=1)
     source[face[smooth]] = before[smooth]
     _write(soft.source, row, 0, source)
-    opened, at_lip = np.zeros((6, len(self._own)), np.uint8), np.zeros(mesh.nvert, bool)
-    half = np.setdiff1d(np.flatnonzero(mesh.twin < 0), np.flatnonzero(whole.twin < 0))
-    half = half[half < 3 * len(self._own)]
-    opened[half % 3, half // 3] = 1
-    at_lip[mesh.elem[half // 3, half % 3]] = at_lip[mesh.elem[half // 3, (half + 1) % 3]] = True
-    opened[3:] = at_lip[mesh.elem[: len(self._own)]].T
+    lip, at_lip = np.zeros((6, len(self._own)), np.uint8), np.zeros(mesh.nvert, bool)
+    half = opened(mesh)
+    lip[half % 3, half // 3] = 1
+    at_lip[corners(mesh, half, 0)] = at_lip[corners(mesh, half, 1)] = True
+    lip[3:] = at_lip[mesh.elem[: len(self._own)]].T
     sides, first = np.zeros(len(face), np.uint8), len(self._skin)
     for k, weight in enumerate([(1, 2, 4, 8, 16, 32), (4, 2, 1, 8, 32, 16)][: 1 + self._flat]):
       at = slice(first + k * len(self._own), first + (k + 1) * len(self._own))
-      sides[at] = np.dot(weight, opened)
+      sides[at] = np.dot(weight, lip)
     _write(lips, row, self._start, np.where(self.lip >= 0, sides, 0).astype(np.uint8))
 
 
@@ -261,3 +260,10 @@ def _write(out: wp.array, row: int, start: int, values: np.ndarray):
   """Writes values to a row of an array, from a place on."""
   source = wp.array(np.ascontiguousarray(values), dtype=out.dtype, device=out.device)
   wp.copy(out, source, row * (out.size // out.shape[0]) + start * values[0].size, 0, values.size)
+
+
+def _rim(mesh: Mesh, half: np.ndarray) -> np.ndarray:
+  """Returns the triangles between both sides of a sheet along half-edges  (2 n, 3)."""
+  a, b = corners(mesh, half, 0), corners(mesh, half, 1)
+  back = mesh.nskin
+  return np.concatenate([np.stack([b, a, a + back], 1), np.stack([b, a + back, b + back], 1)])

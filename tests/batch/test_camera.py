@@ -5,6 +5,7 @@ import numpy as np
 import palpate
 import palpate.batch
 import pytest
+import trimesh
 import warp as wp
 from devices import needs_cuda
 from palpate.camera import Camera
@@ -167,6 +168,29 @@ def test_cuts_open_and_heal():
   again = camera.draw()
   for name in OUTPUTS:
     np.testing.assert_array_equal(again[name].numpy()[1], whole[name][1])
+
+
+def test_an_open_hollow_organ_shows_its_inside():
+  spec = mj.MjSpec()
+  spec.visual.headlight.ambient = [0.4] * 3
+  spec.worldbody.add_camera(name="eye", pos=[0, 0, 0.3], fovy=30)
+  ball = trimesh.creation.icosphere(3, 0.05)
+  surface = np.array(ball.vertices), np.array(ball.faces)
+  palpate.add_organ(spec, surface, "organ", mass=0.1, spare=150, rgba=(0.3, 0.7, 0.3, 1))
+  model = spec.compile()
+  data = mj.MjData(model)
+  mj.mj_forward(model, data)
+  organ, turn = palpate.Organ(model, data, "organ"), np.linspace(0, 2 * np.pi, 60)
+  organ.cut(np.stack([0.03 * np.cos(turn), 0.03 * np.sin(turn), 0.04 + 0 * turn], axis=1))
+  place, lid = organ.xpos.copy(), organ.pieces[1].vertices
+  place[lid, 0] += 0.04
+  organ.set_state(place)
+  mj.mj_forward(model, data)
+  batch = palpate.batch.make(model, 1, "cpu")
+  batch.set_state(0, data)
+  seen = compare(batch, 0, "eye", batch.camera("eye", SIZE, SIZE, OUTPUTS).draw(), seg=0.98)
+  assert (seen["depth"][SIZE // 2, SIZE // 3 : SIZE // 2] > 0.3).all()  # the far wall's inner side
+  assert (seen["pixels"][SIZE // 2, SIZE // 3 : SIZE // 2, 1] > 50).all()
 
 
 def test_shapes_textures_lamps_and_what_one_sees_through():

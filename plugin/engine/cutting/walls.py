@@ -1,8 +1,8 @@
 """What cuts have opened, drawn in a colour of its own: a flex that nothing touches.
 
-Of a solid its vertices are those of the organ's skin, and its triangles the opened faces. Of a
-sheet it is ribbons along the opened edges, the lips of the cut. They are written when MuJoCo draws;
-between pictures the flex is hidden, so that a step spends nothing on it.
+Along the opened edges it has lips, bands around the edge from the outer side to the inner one. Of a
+solid it also has the opened faces. They are written when MuJoCo draws; between pictures the flex is
+hidden, so that a step spends nothing on it.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
   from ..model.declare import Declaration
 
 LIP = 8e-4  # width of a lip [m]
+# Of the outer half of a lip's profile: places from the edge inward, and heights over the organ's
+# drawn surface [m]. The first one is below it, so that the surface ends the lip neatly.
+PROFILE = np.array([(LIP, -1e-4), (0.6 * LIP, 1.5e-4), (-0.15 * LIP, 1e-4)])
 _COUNTS = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
 
 
@@ -35,7 +38,7 @@ class Walls:
 
   def __init__(self, organ: Declaration, model: int):
     name, mesh = organ.config.walls, organ.mesh
-    self._nvert = mesh.nskin if len(mesh.tet) else 4 * layout.LIPS * mesh.spare
+    self._nvert = room(mesh.nskin, mesh.spare, len(mesh.tet) > 0)[0]
     self._flex, self._shown = -1, True
     if not name:
       return
@@ -70,32 +73,66 @@ class Walls:
   def draw(self, organ: Declaration, disp: np.ndarray, model: int, data: int):
     """Writes the walls, of vertices displaced by `disp` [m], where renderers read them."""
     m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
-    elem = flexes.element_data(m, self._flex)
-    x, wall = self._walls(organ, disp, m) if len(organ.mesh.tet) else _lips(organ.mesh, disp)
-    x, wall = x[: self._nvert], wall[: len(elem)]
+    elem, mesh = flexes.element_data(m, self._flex), organ.mesh
+    skin = mesh.nskin if len(mesh.tet) else 0
+    radius = float(mjstruct.view(m.flex_radius, m.nflex)[organ.flex])
+    x, lips = _lips(mesh, mesh.rest + disp, radius)
+    x = np.concatenate([(mesh.rest + disp)[:skin], x])[: self._nvert]
+    wall = np.concatenate([mesh.elem[mesh.whole.nelem :], skin + lips])
+    wall = wall[(wall < len(x)).all(axis=1)][: len(elem)]
     elem[: len(wall)], elem[len(wall) :] = wall, 0  # without area, which nobody sees
     self._show(m, True)
     start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[self._flex])
     out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + len(x)]
     out[:] = organ.origin + x @ organ.frame.T
 
-  def _walls(self, organ: Declaration, disp: np.ndarray, m) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the skin's vertices [m] and the faces that are open."""
-    mesh = organ.mesh
-    x, whole = (mesh.rest + disp)[: self._nvert], mesh.whole.nelem
-    # The skin is drawn its flex's radius outside: so is the mouth of a cut.
-    radius = mjstruct.view(m.flex_radius, m.nflex)[organ.flex]
-    return x + radius * topology.vertex_normals(x, mesh.elem[:whole]), mesh.elem[whole:]
+
+def room(nskin: int, spare: int, solid: bool) -> tuple[int, int]:
+  """Returns how many vertices and triangles the flex has that draws an organ's walls."""
+  profile = 2 * len(PROFILE)
+  edges = spare * (1 if solid else layout.LIPS)
+  walls = (nskin, layout.WALLS * spare) if solid else (0, 0)
+  return walls[0] + profile * edges, walls[1] + 2 * (profile - 1) * edges
 
 
-def _lips(mesh: topology.Mesh, disp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-  """Returns ribbons along edges that cuts have opened: four vertices [m] and two triangles each."""
-  half = np.setdiff1d(np.flatnonzero(mesh.twin < 0), np.flatnonzero(mesh.whole.twin < 0))
-  x = mesh.rest + disp
-  start, end, other = (x[topology.corners(mesh, half, k)] for k in range(3))
-  along, inward = end - start, other - start
-  inward -= ((inward * along).sum(1) / (along * along).sum(1))[:, None] * along
-  inward *= LIP / np.linalg.norm(inward, axis=1, keepdims=True)
-  places = np.stack([start, end, end + inward, start + inward], axis=1).reshape(-1, 3)
-  quads = 4 * np.arange(len(half))[:, None]
-  return places, (quads + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3)
+def opened(mesh: topology.Mesh) -> np.ndarray:
+  """Returns the half-edges of an organ's own surface that cuts have opened, ascending."""
+  half = np.flatnonzero(mesh.whole.twin >= 0)
+  other = mesh.whole.twin[half]
+  apart = [topology.corners(mesh, half, k) != topology.corners(mesh, other, 1 - k) for k in (0, 1)]
+  return half[np.logical_or(*apart)]
+
+
+def _lips(mesh: topology.Mesh, x: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+  """Returns vertices [m] and triangles of the lips along edges that cuts have opened.
+
+  Args:
+    mesh: of the organ
+    x: its vertices [m]  (nvert, 3)
+    radius: how far its surface is drawn outside and inside [m]
+  """
+  half, elem = opened(mesh), mesh.elem[: mesh.whole.nelem]
+  vert, ends = np.unique([topology.corners(mesh, half, k) for k in (0, 1)], return_inverse=True)
+  ends = ends.reshape(2, -1)
+  out = np.zeros_like(x)  # as MuJoCo draws a flex
+  np.add.at(out, elem, _unit(topology.area_vectors(x, elem))[:, None])
+  out = _unit(out[vert])
+  along = _unit(np.diff(x[vert[ends]], axis=0)[0])
+  into, ahead = np.zeros((2, len(vert), 3))
+  for at, sign in zip(ends, (-1, 1), strict=True):
+    np.add.at(into, at, np.cross(out[at], along))
+    np.add.at(ahead, at, sign * along)
+  tip = np.linalg.norm(into, axis=1) < 0.7  # both lips begin there: the cut points ahead
+  into = _unit(np.where(tip[:, None], ahead, into))
+  outer = PROFILE + np.array([0, radius])
+  across, up = np.concatenate([outer, outer[::-1] * (1, -1)]).T
+  places = x[vert][:, None] + across[:, None] * into[:, None] + up[:, None] * out[:, None]
+  n = len(across)
+  first = n * ends.T[:, None] + np.arange(n - 1)[:, None]
+  quads = np.concatenate([first, first + 1], axis=2).reshape(-1, 4)
+  return places.reshape(-1, 3), quads[:, [[0, 1, 3], [0, 3, 2]]].reshape(-1, 3)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+  """Returns vectors of length 1, (n, 3)."""
+  return vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)

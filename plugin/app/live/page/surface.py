@@ -12,6 +12,7 @@ from typing import Any
 import mujoco as mj
 import numpy as np
 from palpate import Organ
+from palpate.engine.cutting.walls import PROFILE
 from palpate.tissue.geometry import subdivide
 from scipy.sparse import csr_array
 
@@ -44,6 +45,7 @@ class Surface:
       "count": len(self.organ.displacement),
       "look": look(model, self.material, tuple(colour)),
       "inside": (model.flex_rgba[walls] if walls >= 0 else np.array([0.3, 0.05, 0.05])).tolist(),
+      "profile": PROFILE.tolist(),
       "topology": self.topology(),
     }
     if skin is None or self.organ.elem is not self._whole:
@@ -66,8 +68,7 @@ class Surface:
   def topology(self) -> dict[str, Any]:
     """Returns the triangles as they are now, JSON, where a cut has opened them, and places."""
     self._follow()
-    solid = len(self.organ.tetrahedra) > 0
-    lips = np.zeros((0, 3)) if solid else _opened(self._whole, self._elem)
+    lips = _opened(self._whole, self._elem[: len(self._whole)])
     return {
       "triangles": pack(self._elem),
       "outer": len(self._whole),
@@ -140,13 +141,13 @@ def _weights(content: bytes, level: int) -> csr_array:
 
 
 def _opened(whole: np.ndarray, elem: np.ndarray) -> np.ndarray:
-  """Returns the edges that cuts have opened: start, end and opposite vertex  (n, 3)."""
+  """Returns the edges that cuts have opened between an organ's own triangles  (n, 2)."""
 
   def alone(t: np.ndarray) -> np.ndarray:
     tail, head, n = t.ravel(), np.roll(t, -1, axis=1).ravel(), int(t.max()) + 1
     return ~np.isin(head.astype(np.int64) * n + tail, tail.astype(np.int64) * n + head)
 
   if elem is whole:
-    return np.zeros((0, 3), int)
+    return np.zeros((0, 2), int)
   half = np.flatnonzero(alone(elem) & ~alone(whole))
-  return np.stack([elem[half // 3, (half + k) % 3] for k in range(3)], axis=1)
+  return np.stack([elem[half // 3, (half + k) % 3] for k in range(2)], axis=1)

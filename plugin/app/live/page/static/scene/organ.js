@@ -1,13 +1,12 @@
 // An organ: what is drawn for it, its mesh, and what cuts have opened.
 import * as THREE from "../three/three.module.min.js";
-import {fill, normals, put, unpack} from "./geometry.js";
-import {add, dot, scale, sub} from "./vectors.js";
-
-const LIP = 8e-4;  // width of the edge of a cut [m]
+import {fill, put, unpack} from "./geometry.js";
+import {add, cross, scale, sub, unit} from "./vectors.js";
 
 export class Organ {
   // `surface` makes the material of a look, on a side.
-  constructor(world, {look, inside, topology, smooth, count}, surface) {
+  constructor(world, {look, inside, topology, smooth, count, profile}, surface) {
+    this.profile = [...profile, ...profile.map(([far, high]) => [far, -high]).reverse()];  // of the lips of cuts
     this.count = 3 * count;  // numbers of all vertices that there may be
     this.smooth = smooth && {
       from: unpack(smooth.indptr), nodes: unpack(smooth.indices), share: unpack(smooth.data), count: unpack(smooth.indptr).length - 1,
@@ -19,9 +18,10 @@ export class Organ {
       if (smooth.uv) this.skin.geometry.setAttribute("uv", new THREE.BufferAttribute(unpack(smooth.uv), 2));
     }
     this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshBasicMaterial({wireframe: true, color: 0xf0b8a0}));
-    this.walls = new THREE.Mesh(new THREE.BufferGeometry(), surface({rgba: [...inside.slice(0, 3), 1], specular: 0.7, shininess: 0.8}, THREE.DoubleSide));
-    for (const each of [this.skin, this.mesh, this.walls]) each.frustumCulled = false;
-    world.add(this.skin, this.mesh, this.walls);
+    const raw = surface({rgba: [...inside.slice(0, 3), 1], specular: 0.7, shininess: 0.8}, THREE.DoubleSide);
+    [this.walls, this.rims] = [0, 1].map(() => new THREE.Mesh(new THREE.BufferGeometry(), raw));
+    for (const each of [this.skin, this.mesh, this.walls, this.rims]) each.frustumCulled = false;
+    world.add(this.skin, this.mesh, this.walls, this.rims);
     this.sew(topology);
   }
 
@@ -43,15 +43,20 @@ export class Organ {
     }
     this.skin.geometry.setIndex(new THREE.BufferAttribute(this.elem, 1));
     if (uv) this.skin.geometry.setAttribute("uv", new THREE.BufferAttribute(unpack(uv), 2));
-    const n = this.lips.length / 3, quads = [];
-    for (let i = 0; i < n; i++) quads.push(4 * i, 4 * i + 1, 4 * i + 2, 4 * i, 4 * i + 2, 4 * i + 3);
-    this.walls.geometry.setIndex(n ? quads : new THREE.BufferAttribute(this.opened, 1));
+    this.ends = new Map([...new Set(this.lips)].map((v, i) => [v, i]));
+    const n = this.profile.length, band = [];
+    for (let i = 0; i < this.lips.length; i += 2) {
+      const [a, b] = [0, 1].map(k => n * this.ends.get(this.lips[i + k]));
+      for (let k = 0; k < n - 1; k++) band.push(a + k, b + k, b + k + 1, a + k, b + k + 1, a + k + 1);
+    }
+    this.rims.geometry.setIndex(band);
+    this.walls.geometry.setIndex(new THREE.BufferAttribute(this.opened, 1));
     return open.filter(v => !before.has(v));
   }
 
   // Lays the surfaces over its nodes, or the mesh alone.
   drape(nodes, wire) {
-    const {skin, mesh, walls, smooth} = this;
+    const {skin, mesh, walls, rims, smooth} = this;
     skin.visible = !wire;
     mesh.visible = wire;
     if (wire) fill(mesh.geometry, nodes, null);
@@ -74,21 +79,27 @@ export class Organ {
     } else {
       fill(skin.geometry, nodes, this.elem);
     }
-    walls.visible = !wire && (this.lips.length > 0 || this.opened.length > 0);
-    if (!walls.visible) return;
-    if (this.lips.length) fill(walls.geometry, ribbons(this.lips, nodes), walls.geometry.index.array);
-    else fill(walls.geometry, nodes, this.opened);
+    rims.visible = !wire && this.lips.length > 0;
+    walls.visible = !wire && this.opened.length > 0;
+    if (rims.visible) fill(rims.geometry, profiles(this.profile, this.lips, this.ends, nodes, skin.geometry.attributes.normal.array), rims.geometry.index.array);
+    if (walls.visible) fill(walls.geometry, nodes, this.opened);
   }
 }
 
-// Quads along opened edges: start, end, and both moved into their triangle.
-function ribbons(lips, x) {
-  const out = new Float32Array(4 * lips.length);
-  for (let i = 0; i < lips.length; i += 3) {
-    const [a, b, c] = [0, 1, 2].map(k => [0, 1, 2].map(j => x[3 * lips[i + k] + j]));
-    const along = sub(b, a), side = sub(c, a), inward = sub(side, scale(along, dot(side, along) / Math.max(dot(along, along), 1e-12)));
-    const step = scale(inward, LIP / Math.max(Math.hypot(...inward), 1e-9));
-    [a, b, add(b, step), add(a, step)].forEach((p, k) => out.set(p, 4 * i + 3 * k));
+// Places of the lips of cuts: a profile at each vertex, as in palpate/engine/cutting/walls.py.
+function profiles(profile, lips, ends, x, normal) {
+  const at = (array, v) => [array[3 * v], array[3 * v + 1], array[3 * v + 2]];
+  const inward = new Map([...ends.keys()].map(v => [v, [0, 0, 0]])), ahead = new Map(inward), out = new Float32Array(3 * profile.length * ends.size);
+  for (let i = 0; i < lips.length; i += 2) {
+    const along = unit(sub(at(x, lips[i + 1]), at(x, lips[i])));
+    for (const [v, sign] of [[lips[i], -1], [lips[i + 1], 1]]) {
+      inward.set(v, add(inward.get(v), cross(at(normal, v), along)));
+      ahead.set(v, add(ahead.get(v), scale(along, sign)));
+    }
+  }
+  for (const [v, k] of ends) {
+    const into = unit(Math.hypot(...inward.get(v)) < 0.7 ? ahead.get(v) : inward.get(v));
+    profile.forEach(([far, high], j) => out.set(add(at(x, v), add(scale(into, far), scale(at(normal, v), high))), 3 * (profile.length * k + j)));
   }
   return out;
 }
