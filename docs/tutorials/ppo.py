@@ -1,7 +1,7 @@
 """Learn an exercise from nothing: proximal policy optimisation in one file, with torch alone.
 
-    python docs/tutorials/ppo.py grasp/easy --discount 0.95 > curve.csv  # a GPU, 1024 worlds
-    python docs/tutorials/ppo.py touch/easy --device cpu --worlds 32     # the same, slowly
+    python docs/tutorials/ppo.py grasp/easy > curve.csv                # a GPU, 1024 worlds
+    python docs/tutorials/ppo.py touch/easy --device cpu --worlds 32   # the same, slowly
 
 No expert takes part: the environment pays the change of a potential, which tells the way. The
 algorithm is that of Schulman et al. 2017 (10.48550/arXiv.1707.06347), its learning rate adaptive.
@@ -15,7 +15,7 @@ import palpate.tasks  # noqa: F401 - registers the exercises
 import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 
-LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.95, 0.2, 5, 4
+DISCOUNT, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.95, 0.95, 0.2, 5, 4  # see docs/training.md
 KL, ENTROPY, NOISE = 0.02, 0.001, 0.4  # change of the policy aimed at, in a minibatch
 STEPS, SCALE = 8, 10.0  # decisions of an iteration; of rewards, which add up to that
 FINE, LEFT = 0.005, 0.05  # the last of the way [m] and of the progress have scales of their own
@@ -106,7 +106,7 @@ def main() -> None:
   """Learns until enough worlds succeed, or the time is over; prints the curve."""
   parser = argparse.ArgumentParser(description="Learns an exercise from nothing.")
   parser.add_argument("task", nargs="?", default="touch/easy")
-  for name, most in dict(device="cuda:0", worlds=1024, minutes=5.0, seed=0, discount=0.99).items():
+  for name, most in dict(device="cuda:0", worlds=1024, minutes=5.0, seed=0).items():
     parser.add_argument(f"--{name}", type=type(most), default=most, help="(%(default)s)")
   args = parser.parse_args()
   torch.manual_seed(args.seed)
@@ -132,7 +132,7 @@ def main() -> None:
     *told, paid, goes, value = (torch.stack(column) for column in zip(*data, strict=True))
     advantage, gain, then = torch.zeros_like(paid), 0.0, [*value[1:], agent(look(seen))[1]]
     for k in reversed(range(STEPS)):
-      advantage[k] = gain = paid[k] - value[k] + args.discount * goes[k] * (then[k] + LAMBDA * gain)
+      advantage[k] = gain = paid[k] - value[k] + DISCOUNT * goes[k] * (then[k] + LAMBDA * gain)
     if steps:  # after the first iteration it knows how large observations are
       update(agent, adam, [x.flatten(0, 1) for x in (*told, advantage, advantage + value)])
     agent.train()(told[0].flatten(0, 1))

@@ -22,7 +22,6 @@ from palpate import tasks
 
 SCRIPT = pathlib.Path(__file__).parents[3] / "docs" / "tutorials" / "ppo.py"
 NAMES = tuple(f"{domain}/easy" for domain in ("touch", "probe", "trace", "grasp", "retract"))
-DISCOUNT = {"grasp/easy": 0.95}  # where it is not the script's own, see docs/training.md
 ENOUGH = 90.0  # success that is asked for [%]
 POINTS = 30  # rows that are kept of a curve, and the last
 
@@ -43,9 +42,7 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   keys = {key: getattr(args, key) for key in ("device", "worlds", "most")}
   keys |= {"worlds": 4, "most": 0.05} if args.short else {}
   cases = [
-    {"case": f"{task}-{seed}", "task": task, "seed": seed}
-    | keys
-    | ({"discount": DISCOUNT[task]} if task in DISCOUNT else {})
+    {"case": f"{task}-{seed}", "task": task, "seed": seed} | keys
     for seed in args.seeds
     for task in args.tasks
   ]
@@ -54,9 +51,8 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
 
 def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Trains, and returns rows of the curve."""
-  options = {"minutes": "most"} | {key: key for key in ("device", "worlds", "seed", "discount")}
-  told = {name: case[key] for name, key in options.items() if key in case}
-  words = [word for name, value in told.items() for word in (f"--{name}", str(value))]
+  options = {"minutes": "most"} | {key: key for key in ("device", "worlds", "seed")}
+  words = [word for name, key in options.items() for word in (f"--{name}", str(case[key]))]
   command = [sys.executable, str(SCRIPT), case["task"], *words]
   with tempfile.TemporaryFile("w+", encoding="utf-8") as curve:
     ended = subprocess.run(command, stdout=curve, stderr=subprocess.PIPE, text=True)
