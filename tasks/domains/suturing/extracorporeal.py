@@ -302,8 +302,11 @@ class Extracorporeal(Task):
       laid = self.laid
       goal = np.array([0.0, 0.0, drain.HIGH + 0.001])
       yield from p.move(goal, speed=0.02)
-      for _ in range(_TRIES):
-        yield from _until(p, 0.8, lambda laid=laid: self.seated == laid)
+      # On a double throw others lock loose: they are let go and drawn tight before they stay.
+      loose = 2 if self.turns[0] > 1 and laid > 1 else 0
+      for k in range(_TRIES):
+        waits = 0.5 * _STAYS if k < loose else 0.8
+        yield from _until(p, waits, lambda laid=laid: self.seated == laid)
         if self.seated == laid:
           break
         # A throw that is pressed on locks. Let go, it slides on and the hands draw the slack up.
