@@ -1,8 +1,9 @@
 """Cut: cut out a marked piece of a sheet of tissue with a scalpel, along its line.
 
-Own observations: `target` (3,), from the tip to the next point of the line [m]; `ahead` (3, 3),
-from the tip to points 5, 10 and 15 mm further along the line [m]; `covered` (1,), share of the line
-that is cut [-]; `deviation` (1,), largest distance of the cut from the line so far [m].
+Own observations: `target` (3,), from the tip to the next point of the line, and once 98 % are cut
+to the one after the nearest [m]; `ahead` (3, 3), from the tip to points 5, 10 and 15 mm further
+along the line [m]; `covered` (1,), share of the line that is cut [-]; `deviation` (1,), largest
+distance of the cut from the line so far [m].
 
 Progress: 0.1 * closeness to the line, at its best, + 0.9 * share of the line that is cut. A point
 of the line is cut where the edge has gone through the wall within the tolerance of it, slower than
@@ -121,7 +122,7 @@ class State:
   curve: Annotated[Any, Array(wp.vec3, ("room",))]  # these [m]
   cut: Annotated[Any, ints("room")]  # whether they are cut
   done: int  # how many are
-  next: int  # the first that is not, after those that are
+  next: int  # the first that is not, after those that are; the one to go on to where enough are
   length: float  # of the line [m]
   opened: float  # length that was cut so far [m]
   astray: float  # length of that beyond the tolerance, slashed or dragged [m]
@@ -234,8 +235,11 @@ def advance(s, o):
   o.travelled = travelled
   if o.astray > ASTRAY or o.traction > 2.0 * o.limit:
     return o, -1.0, DAMAGED
-  if o.covered >= COVERED and (o.opened > o.length + CLOSING or pieces(s) > 1):
-    return o, 1.0, SUCCESS
+  if o.covered >= COVERED:
+    if o.opened > o.length + CLOSING or pieces(s) > 1:
+      return o, 1.0, SUCCESS
+    here, _ = nearest(o, tip(s))  # the piece hangs together still: the cut goes on
+    o.next = (here + 1) % o.count
   o.nearest = max(o.nearest, closeness(distance(s, o), o.distance0))
   return o, 0.1 * o.nearest + 0.9 * o.covered, RUNNING
 

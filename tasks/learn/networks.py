@@ -15,9 +15,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import palpate
 import torch
-from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch.nn.functional import smooth_l1_loss
 from torch.nn.utils.rnn import pad_sequence
@@ -25,11 +26,13 @@ from torch.nn.utils.rnn import pad_sequence
 from ..core.observation import ROWS
 from . import policy
 from .lessons import Lesson
-from .sight import PICTURES, Seeing
+from .sight import PICTURES, Seeing, Sensing
 
 HIDDEN = ("joint_vel", "drive", "tip_vel", "surface")  # from an actor that is taught
 ACTING, MORE = "acting", "more"  # groups of observations
 CHANGES = ("jaw", "head")  # ends of components that an actor says as changes: jaws close by and by
+# Ends of offsets [m] that an actor sees on a finer scale too: they begin large and decide small.
+FINELY = ("target", "front", "lead", "trail")
 POWER = 2.0  # an action is what the actor says times its size: slow motion is as clear as fast
 CLONING = 700  # steps of the optimiser of a round, by default
 _BATCH, _RATE = 32, 3e-3  # lessons of a step
@@ -114,8 +117,9 @@ class Networks:
     sets = {"actor": [ACTING], "critic": [g for g in self.groups if g != PICTURES]}
     recurrent: dict[str, Any] = {"rnn_type": "gru", "rnn_hidden_dim": memory}
     recurrent["distribution_cfg"], count = gaussian, len(components)
+    recurrent["fine"] = self.fine = self._columns(FINELY)
     self.pixels = self._shapes[policy.PIXELS][:2] if PICTURES in self.groups else ()
-    kind: Any = functools.partial(Seeing, size=self.pixels) if self.pixels else RNNModel
+    kind: Any = functools.partial(Seeing, size=self.pixels) if self.pixels else Sensing
     self.actor: Any = kind(seen, sets, "actor", count, **recurrent, **common).to(device)
     self.critic: Any = MLPModel(seen, sets, "critic", 1, **common).to(device)
     self._last: Any = torch.optim.Adam(self._parts())
@@ -125,6 +129,15 @@ class Networks:
 
   def _width(self, names: Sequence[str]) -> int:
     return sum(math.prod(self._shapes[name]) for name in names)
+
+  def _columns(self, ends: tuple[str, ...]) -> list[int]:
+    """Returns where in what the actor sees the observations are whose names end so."""
+    at, found = 0, []
+    for name in self.groups[ACTING]:
+      size = self._width([name])
+      found += range(at, at + size) if name.endswith(ends) else ()
+      at += size
+    return found
 
   def normalise(self, seen: TensorDict) -> None:
     """Learns how large observations are; what was learned with others says the same as before."""
@@ -156,6 +169,9 @@ class Networks:
     weights, (mean, std) = self.actor.state_dict(), (made.mean, 1.0 / made.scale)
     linear = [k.removesuffix(".weight") for k in weights if k.startswith("mlp") and "weight" in k]
     arrays = dict(zip([f"rnn.rnn.{gate}_l0" for gate in _GATES], made.memory or (), strict=False))
+    if self.fine and not made.about.fine and made.memory:  # it saw nothing on that scale
+      at, blind = len(made.mean), np.zeros((len(made.memory[0]), len(self.fine)), np.float32)
+      arrays[f"rnn.rnn.{_GATES[0]}_l0"] = np.insert(made.memory[0], [at], blind, axis=1)
     pairs = [*zip(linear, made.layers, strict=False), *self._encoder(made.encoder)]
     for name, (weight, bias) in pairs:
       arrays |= {f"{name}.weight": weight, f"{name}.bias": bias}
@@ -270,7 +286,7 @@ class Networks:
   def _error(self, some: TensorDict) -> torch.Tensor:
     """Returns how far the actor is from what was meant, each component by its size in lessons."""
     actor = self.actor
-    latent, _ = actor.rnn.rnn(actor.obs_normalizer(some["seen"][ACTING]))
+    latent, _ = actor.rnn.rnn(actor.sense(some["seen"]))
     return self.error(latent, some["says"], some["taught"])
 
   def error(self, latent: torch.Tensor, says: torch.Tensor, taught: torch.Tensor) -> torch.Tensor:
@@ -314,7 +330,7 @@ class Networks:
     about = policy.About(
       task.name, tuple(task.components), self.groups[ACTING], task.control_timestep, POWER,
       self._changes, self.initial_action.tolist(), dict(task_kwargs),
-      {"palpate": palpate.__version__, **training}, pixels=self.pixels,
+      {"palpate": palpate.__version__, **training}, pixels=self.pixels, fine=self.fine,
     )  # fmt: skip
     layers = self._encoder(self.actor.encoder.layers if self.pixels else [])
     memory: Any = tuple(weights[f"rnn.rnn.{name}_l0"] for name in _GATES)

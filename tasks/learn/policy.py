@@ -31,6 +31,7 @@ FOLDER = pathlib.Path(__file__).parents[1] / "policies"  # of those that come wi
 _KEY = "palpate"  # of the header
 _FORMAT = 2
 _DTYPES = ("F16", "F32", "F64")  # of arrays
+FINE = 0.003  # scale on which some of the input is seen, too [m]
 STRIDE = 2  # of the first convolution; the others have 1
 _ENCODER = "encoder_"  # before the names of its arrays
 _MEMORY = ("input", "state", "input_bias", "state_bias")  # arrays of a memory
@@ -54,6 +55,8 @@ class About:
     training: how it was made, for people
     licence: of the weights
     pixels: height and width of the picture that it sees, empty for none [pixels]
+    fine: numbers of the input that it sees on a scale of `FINE` too: `tanh(x / FINE)` of each
+      follows the normalised input
   """
 
   task: str
@@ -67,6 +70,7 @@ class About:
   training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
   licence: str = "Apache-2.0"
   pixels: Sequence[int] = ()
+  fine: Sequence[int] = ()
 
   @property
   def sees(self) -> bool:
@@ -145,7 +149,10 @@ class Episode:
     policy = self.policy
     names = policy.about.observations
     parts = [np.reshape(observation[name], (*self._count, -1)) for name in names]
-    x = (np.concatenate(parts, axis=-1) - policy.mean) * policy.scale
+    seen = np.concatenate(parts, axis=-1)
+    x = (seen - policy.mean) * policy.scale
+    if policy.about.fine:
+      x = np.concatenate([x, np.tanh(seen[..., list(policy.about.fine)] / FINE)], axis=-1)
     if policy.encoder:
       x = np.concatenate([x, encode(observation[PIXELS], policy.encoder)], axis=-1)
     if policy.memory:
@@ -285,6 +292,8 @@ def _check_about(about: About) -> None:
   numbers = isinstance(first, list | tuple) and all(_is_number(v) and abs(v) <= 1 for v in first)
   if not numbers or len(first) not in (0, count):
     raise ValueError(f"initial_action is {first!r}, expected {count} numbers in [-1, 1] or none")
+  if not isinstance(about.fine, list | tuple) or not all(type(n) is int for n in about.fine):
+    raise ValueError(f"fine is {about.fine!r}, expected numbers of the input")
   size = about.pixels
   if not isinstance(size, list | tuple) or not all(type(n) is int and n > 0 for n in size):
     raise ValueError(f"pixels is {size!r}, expected height and width")
@@ -303,7 +312,9 @@ def _check_shapes(policy: Policy) -> None:
   size = len(policy.mean)
   if policy.scale.shape != (size,):
     raise ValueError(f"scale has shape {policy.scale.shape}, expected ({size},)")
-  size += _check_encoder(policy)
+  if not all(0 <= n < size for n in policy.about.fine):
+    raise ValueError(f"fine is {list(policy.about.fine)}, expected numbers from 0 to {size - 1}")
+  size += len(policy.about.fine) + _check_encoder(policy)
   if policy.memory:
     count = policy.memory[1].shape[-1]
     expected = [(3 * count, size), (3 * count, count), (3 * count,), (3 * count,)]

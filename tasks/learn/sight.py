@@ -16,7 +16,7 @@ from rsl_rl.modules import RNN
 from tensordict import TensorDict
 from torch import nn
 
-from .policy import STRIDE
+from .policy import FINE, STRIDE
 
 PICTURES = "pictures"  # group of observations
 CHANNELS, KERNELS = (16, 32, 32), (5, 3, 3)  # of the convolutions
@@ -67,8 +67,8 @@ class Encoder(nn.Module):
     return said.reshape(*pixels.shape[:-1], SAID)
 
 
-class Seeing(RNNModel):
-  """A recurrent actor with an encoder."""
+class Sensing(RNNModel):
+  """A recurrent actor that sees some of its observations on a finer scale too."""
 
   def __init__(
     self,
@@ -76,21 +76,35 @@ class Seeing(RNNModel):
     sets: Mapping[str, Sequence[str]],
     name: str,
     count: int,
-    size: Sequence[int],
+    fine: Sequence[int] = (),
     **options: Any,
   ):
-    """Makes the actor; arguments as of `RNNModel`, and the height and width of pictures."""
+    """Makes the actor; arguments as of `RNNModel`, and the columns of `policy.About.fine`."""
     super().__init__(seen, dict(sets), name, count, **options)  # pyright: ignore
-    self.encoder = Encoder(size)
-    self.rnn = RNN(self.obs_dim + SAID, self.latent_dim, type="gru")
+    self.fine = list(fine)
+    self.rnn = RNN(self.obs_dim + len(self.fine), self.latent_dim, type="gru")
 
   def sense(self, seen: TensorDict) -> torch.Tensor:
     """Returns what goes into the memory  (..., n)."""
     flat = torch.cat([seen[group] for group in self.obs_groups], dim=-1)
-    return torch.cat([self.obs_normalizer(flat), self.encoder(seen[PICTURES])], dim=-1)
+    return torch.cat([self.obs_normalizer(flat), (flat[..., self.fine] / FINE).tanh()], dim=-1)
 
   def get_latent(
     self, obs: TensorDict, masks: torch.Tensor | None = None, hidden_state: Any = None
   ) -> torch.Tensor:
     """See `RNNModel`."""
     return self.rnn(self.sense(obs), masks, hidden_state).squeeze(0)
+
+
+class Seeing(Sensing):
+  """One with an encoder."""
+
+  def __init__(self, *args: Any, size: Sequence[int], **options: Any):
+    """Makes the actor; arguments as of `Sensing`, and the height and width of pictures."""
+    super().__init__(*args, **options)
+    self.encoder = Encoder(size)
+    self.rnn = RNN(self.rnn.rnn.input_size + SAID, self.latent_dim, type="gru")
+
+  def sense(self, seen: TensorDict) -> torch.Tensor:
+    """See `Sensing`."""
+    return torch.cat([super().sense(seen), self.encoder(seen[PICTURES])], dim=-1)

@@ -16,6 +16,7 @@ from palpate.tasks.batch import vector  # noqa: E402
 from palpate.tasks.core import observation  # noqa: E402
 from palpate.tasks.learn import distillation, learning, networks, policy, rsl  # noqa: E402
 from palpate.tasks.learn.lessons import Lesson  # noqa: E402
+from tensordict import TensorDict  # noqa: E402
 
 SMALL = ["--device", "cpu", "--num-envs", "2", "--processes", "1", "--set", "time_limit=0.4"]
 
@@ -171,6 +172,35 @@ def test_networks_take_up_a_policy_and_keep_it_where_observations_vary_otherwise
   for _ in range(3):
     seen = {name: random.randn(*shape) for name, shape in shapes.items()}
     np.testing.assert_allclose(one(seen), other(seen), atol=1e-4)
+
+
+def test_offsets_are_seen_on_a_finer_scale_which_an_older_policy_begins_without(monkeypatch):
+  names, shapes = ("pitch", "jaw"), {"held": (1,), "hook_front": (3,), "target": (3,)}
+  task = SimpleNamespace(name="any/easy", components=names, control_timestep=0.02)
+
+  def made(seed):
+    return networks.Networks(shapes, names, 8, (8,), 0.1, seed, "cpu")
+
+  random = np.random.RandomState(0)
+  seen = {name: random.randn(*shape) for name, shape in shapes.items()}
+  with monkeypatch.context() as without:
+    without.setattr(networks, "FINELY", ())
+    older = made(0).policy(task, {}, {})
+  newer = made(1)
+  newer.take(older)
+  taken = newer.policy(task, {}, {})
+  assert older.about.fine == [] and taken.about.fine == [1, 2, 3, 4, 5, 6]
+  np.testing.assert_allclose(taken.begin()(seen), older.begin()(seen), atol=1e-6)
+  learned, some = made(1), TensorDict({"acting": torch.randn(5, 1, 7) * 1e-3}, batch_size=[5, 1])
+  act = learned.policy(task, {}, {}).begin()
+  with torch.no_grad():
+    latent, _ = learned.actor.rnn.rnn(learned.actor.sense(some))
+    said = learned.actor.mlp(latent)[:, 0]
+  last = torch.zeros(2)
+  for row, says in zip(some["acting"][:, 0].numpy(), said, strict=True):
+    last = learned.action(says, last)
+    step = {"held": row[:1], "hook_front": row[1:4], "target": row[4:]}
+    np.testing.assert_allclose(act(step), last, atol=1e-5)
 
 
 def test_what_is_held_from_the_start_is_no_change_to_learn(monkeypatch):
