@@ -90,7 +90,7 @@ def test_a_needle_goes_through_a_wall_of_two_layers_as_under_the_plugin(device):
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_thread_through_both_layers_of_a_wall_is_held_as_under_the_plugin(device):
   """Both hold it, and neither touches it in between."""
-  spec = one.wall(nodes=16, pos=(0.017, 0, 0), contact=APART)
+  spec = one.wall(nodes=16, pos=(0.0172, 0, 0), contact=APART)
   model, data, organ = one.load(spec)
   lower = palpate.Organ(model, data, "lower")
   one.drive(model, data, organ, [4.6])
