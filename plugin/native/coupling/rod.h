@@ -222,10 +222,10 @@ template <class Host>
 PALPATE void yield_tree(const Host& host, int first, int nefc, const int* type, const int* id) {
   const auto& rod = host.rod;
   const int n = rod.count.data[0], tree = rod.row_tree.data[first], node = nodes_of(rod);
+  if (node + REACH / 3 > rod.most_nodes) return;
   Tree<Host> other{host};
   for (int at = first; at < n; ++at)
     if (rod.row_tree.data[at] == tree) other.take(host.row(rod.row_efc.data[at]));
-  if (node + REACH / 3 > rod.most_nodes) return;
   rod.count.data[3] += (other.count + 2) / 3;
   other.weigh();
   other.hold(nefc, type, id);
@@ -242,12 +242,9 @@ PALPATE void yield_tree(const Host& host, int first, int nefc, const int* type, 
 // Lets the bodies that the noted rows reach yield.
 template <class Host>
 PALPATE void yield_trees(const Host& host, int nefc, const int* type, const int* id) {
-  const int* tree = host.rod.row_tree.data;
-  for (int first = 0; first < host.rod.count.data[0]; ++first) {
-    bool done = tree[first] < 0;
-    for (int at = 0; at < first && !done; ++at) done = tree[at] == tree[first];
-    if (!done) yield_tree(host, first, nefc, type, id);
-  }
+  const auto& rod = host.rod;
+  for (int r = 0; r < rod.count.data[0]; ++r)
+    if (rod.row_tree.data[r] >= 0 && rod.row_yields.data[r] < 0) yield_tree(host, r, nefc, type, id);
 }
 
 template <class Rod>

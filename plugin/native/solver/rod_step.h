@@ -3,9 +3,10 @@
 //   sum m / (2 h^2) |x - x0 - h v - h^2 f / m|^2 + c / (2 h) |x - x0|^2 + E(x) + h^2 sum s(J a + B b - aref)
 //   + h^2 / 2 |b|^2,   a = (x - x0 - h v) / h^2,
 //
-// c the drag of a node and b how bodies yield, in coordinates in which their inertia is 1 kg, by Newton's method with a line search. The last sum is MuJoCo's cost of the constraints
-// that the rod takes part in (Todorov 2014, doi:10.1109/ICRA.2014.6907751), with the rod's own stiffness in place
-// of MuJoCo's inertia. A row's dofs are those of two neighbouring nodes, so the matrix stays banded.
+// c the drag of a node and b how bodies yield, in coordinates in which their inertia is 1 kg, by Newton's method with a
+// line search. The sum of s is MuJoCo's cost of the constraints that the rod takes part in (Todorov 2014,
+// doi:10.1109/ICRA.2014.6907751), with the rod's own stiffness in place of MuJoCo's inertia. A row's dofs are those of two
+// neighbouring nodes and of bodies that yield, so the matrix stays sparse.
 #pragma once
 #include "tissue/rod_contact.h"
 #include "tissue/rod_ties.h"
