@@ -60,8 +60,7 @@ class Rest:
     for thread in batch.rods.all.values():
       f = thread.fields
       self.starts += [_start(f.now, thread.declared.rest)]
-      own = f.speed, thread.twist, thread.borne, thread.broken
-      self.starts += [_start(array) for array in own]
+      self.starts += [_start(array) for array in (f.speed, *thread.own.values())]
     self._rows = self.starts + [_start(array) for array in zero if array.size]
     self._move = move = kernels.Move()
     for name, array in arrays_of(kernels.Move, batch.m, d).items():

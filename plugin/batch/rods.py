@@ -10,6 +10,7 @@ import functools
 from typing import TYPE_CHECKING, Any
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 from palpate.engine import rods
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 _EACH = 2  # contacts of an edge with geoms, and as many more of a thread
 _BEYOND = 16
+_OF_DOFS = ("pushed", "accelerated")  # what a state has for each dof
 _LANES = 32  # threads of a world
 _ITERATIONS = 60  # of a step, at most: all worlds wait for the one that takes longest
 
@@ -34,8 +36,9 @@ _ITERATIONS = 60  # of a step, at most: all worlds wait for the one that takes l
 @theirs(
   "contact_",
   option="gravity",
-  model="M_rowadr M_rownnz M_colind",
-  data="qpos qvel qfrc_applied xfrc_applied qfrc_passive qfrc_smooth qacc qacc_warmstart M nefc",
+  model="M_rowadr M_rownnz M_colind dof_damping",
+  data="qpos qvel qfrc_applied xfrc_applied qfrc_passive qfrc_actuator qfrc_smooth qacc "
+  "qacc_warmstart M nefc",
   contact="dim flex elem geom friction",
   efc="type id J J_rownnz J_rowadr J_colind D aref force",
 )
@@ -79,7 +82,7 @@ def most_contacts(space: rods.Workspace) -> int:
 
 def bytes_of(space: rods.Workspace) -> float:
   """Returns about how many bytes a world takes of a thread."""
-  return float(sum(8 * each.size for each in rods.scratch(len(space.organ.rest)).values()))
+  return float(sum(8 * each.size for each in rods.scratch(len(space.organ.rest), 0).values()))
 
 
 class Thread(base.Thread):
@@ -102,14 +105,14 @@ class Thread(base.Thread):
     mass = space.mass
     shared = space.constants | rods.settings(organ, space.friction) | {"mass": mass}
     shared["newton"] = min(shared["newton"], _ITERATIONS)
-    self.twist, self.broken, self.borne = (
-      wp.zeros((nworld, size), dtype=wp.float64, device=device) for size in (n, n, bare.nv)
-    )
-    own = {"twist": self.twist, "borne": self.borne, "broken": self.broken}
-    own["signature"] = wp.zeros((nworld, 1), dtype=wp.float64, device=device)
-    each = {
-      name: _rows(Rod, name, start, nworld, device) for name, start in rods.scratch(n).items()
+    sizes = {"twist": n, "broken": n, "pushed": bare.nv, "accelerated": bare.nv, "signature": 1}
+    self.own = own = {
+      name: wp.zeros((nworld, size), dtype=wp.float64, device=device)
+      for name, size in sizes.items()
     }
+    self.broken = own["broken"]
+    scratch = rods.scratch(n, bare.nv).items()
+    each = {name: _rows(Rod, name, start, nworld, device) for name, start in scratch}
     self.iterations = each["status"]
     self.ties = Ties(nworld, device)
     each |= self.ties.arrays
@@ -194,11 +197,14 @@ class Thread(base.Thread):
     data.qpos[organ.qposs] = self._batch.model.qpos0[organ.qposs] + moved
     data.qvel[organ.dofs] = speed[organ.free].ravel()
     own = self._own(data)
-    for name in ("twist", "broken"):
-      getattr(own, name)[:] = getattr(self, name)[world].numpy()
     kept = self._batch.kept[1]
-    own.borne[:] = 0.0
-    own.borne[kept] = self.borne[world].numpy()[: len(kept)]
+    for name, array in self.own.items():
+      into, values = getattr(own, name), array[world].numpy()
+      if name in _OF_DOFS:
+        into[:] = 0.0
+        into[kept] = values[: len(kept)]
+      else:
+        into[:] = values
     own.signature[:] = organ.signature
 
   def push(self, world: int, data: mujoco.MjData):
@@ -211,11 +217,12 @@ class Thread(base.Thread):
       if name == "now":
         row[organ.free] -= self._batch.model.qpos0[adr].reshape(-1, 3) - organ.rest[organ.free]
       array[world].assign(row)
-    for name in ("twist", "broken"):
-      getattr(self, name)[world].assign(getattr(own, name))
-    borne, kept = np.zeros(self.borne.shape[1]), self._batch.kept[1]
-    borne[: len(kept)] = own.borne[kept]
-    self.borne[world].assign(borne)
+    kept = self._batch.kept[1]
+    for name, array in self.own.items():
+      values = getattr(own, name)
+      if name in _OF_DOFS:
+        values = np.append(values[kept], np.zeros(array.shape[1] - len(kept)))
+      array[world].assign(values)
 
   def _own(self, data: mujoco.MjData):
     """Returns views of its part of the plugin state."""
@@ -258,6 +265,7 @@ class Rods:
       return
     dim, device = self._early.dim.shape, self._batch.device
     wp.launch(take_early, dim=dim, inputs=[self._early], device=device)
+    mjw.fwd_actuation(self._batch.m, self._batch.d)
     for each in self.all.values():
       each.begin()
 

@@ -314,7 +314,8 @@ class RodState:
   """Plugin state of a thread, see `rods`."""
 
   twist: doubles("nvert")  # twist at each node between two edges, 0 at the ends [rad]
-  borne: doubles("nv")  # generalized force of its constraints on other bodies in the last step
+  pushed: doubles("nv")  # force on other bodies in the last step: known, and its constraints'
+  accelerated: doubles("nv")  # their acceleration then
   broken: doubles("nvert")  # whether an edge has broken
   signature: doubles(1)  # of the thread; 0 where it was set by hand [-]
 

@@ -36,15 +36,15 @@ _MOST_PAIRS = 32  # of edges near each other, for one node
 _SOFT = 0.05  # modulus across a thread over that along it, an estimate
 _SLOW = 1e-6  # velocity below which friction within a thread is viscous [m/s]
 _MUJOCOS = (
-  *("jacobian", "flex_margin", "qvel", "qacc", "qacc_warmstart", "qfrc_smooth"),
-  *("M_rowadr", "M_rownnz", "M_colind"),
+  *("jacobian", "flex_margin", "qvel", "qacc", "qacc_warmstart", "qfrc_smooth", "qfrc_actuator"),
+  *("M_rowadr", "M_rownnz", "M_colind", "dof_damping"),
 )
 _WRITTEN = (
   *("start", "vel", "external", "aim", "place", "turn", "force", "move", "trial", "gradient"),
   *("matrix", "inverse", "rank", "near", "ranked", "first", "start_of_row", "below", "status"),
   *("count", "smooth", "reach", "listed", "pair", "pressure", "touch"),
   *("row_kind", "row_node", "row_efc", "row_tree", "row_yields", "row_body"),
-  *("row_value", "grip"),
+  *("row_value", "grip", "known", "speed"),
 )
 _HUGE = 1e6  # more than any twist [rad]
 
@@ -107,11 +107,13 @@ class Rod:
   row_kind: ints("nrow")  # see `RowKind`
   row_node: ints("nrow")  # the first of the two nodes
   row_efc: ints("nrow")  # its number in MuJoCo
-  row_tree: ints("nrow")  # tree of bodies that it reaches, if that yields to the rod, or -1
+  row_tree: ints("nrow")  # tree of bodies that it reaches, -1 for none, -3 if these do not yield
   row_yields: ints("nrow")  # first of the nodes that stand for that, or -1
   row_body: doubles("nrow", 12)  # J of these
   row_value: doubles("nrow", 9)  # J of their dofs; J a of other bodies less aref; D; friction
   grip: ints("nnode")  # tree of bodies that holds a node or one near it, or -1
+  known: doubles("nv")  # force on MuJoCo's dofs: applied, passive and of actuators [N]
+  speed: doubles("nv")  # their velocity as the step begins [m/s]
   tie_count: ints(1)  # what holds it, see `coupling.Ties`
   tie_edge: ints("ntie")  # the edge that is held
   tie_value: doubles("ntie", len(layout.TIE))  # see TIE
@@ -245,11 +247,11 @@ def settings(organ: Declaration, friction: float) -> dict:
   )
 
 
-def scratch(n: int) -> dict[str, np.ndarray]:
-  """Returns the fields of `Rod` that a step of n nodes writes."""
+def scratch(n: int, nv: int) -> dict[str, np.ndarray]:
+  """Returns the fields of `Rod` that a step of n nodes among nv dofs writes."""
   most = n + _MOST_BODIES
   sizes = {"nnode": n, "nplace": most, "nunknown": 4 * most, "npair": _MOST_PAIRS * n}
-  sizes |= {"nrow": _MOST_ROWS * n, "nentry": 2 * most * (4 * most + 1)}
+  sizes |= {"nrow": _MOST_ROWS * n, "nentry": 2 * most * (4 * most + 1), "nv": nv}
   return zeros(_WRITTEN, sizes | {"nword_node": -(-most // 32)}, (Rod,))
 
 
@@ -301,6 +303,7 @@ class Workspace:
 
   def bind(self, model: int):
     """Takes the arrays of an mjModel and of the mjData, and records the launches."""
+    self._model = model
     m, organ = mjstruct.Model.from_address(model), self.organ
     n, dofs = len(organ.rest), np.maximum(organ.dofadr, 0)[:, None] + np.arange(3)
     sizes = {"nvert": n, "nv": m.nv}
@@ -314,7 +317,7 @@ class Workspace:
     self.friction = float(mjstruct.view(m.flex_friction, (m.nflex, 3))[organ.flex, 0])
     self.constants = rod.constants(organ.rest, organ.radius, organ.config, mass, organ.clamped)
     self.own = layout.carve(RodState, self.state, sizes)
-    values = self.constants | settings(organ, self.friction) | scratch(n)
+    values = self.constants | settings(organ, self.friction) | scratch(n, m.nv)
     self.ties = coupling.ties(self.data, organ.flex)
     self.ties.lead = self._lead
     values |= {"mass": mass, "own": self.own}
@@ -367,6 +370,7 @@ class Workspace:
       self.ties.led = False
       return
     self.ties.aim()
+    mjstruct.library().mj_fwdActuation(self._model, self.data)  # MuJoCo does so later
     self._begin.launch()
     self.report.computed = True
     if self._status[0] < 0:

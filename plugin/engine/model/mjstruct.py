@@ -100,6 +100,7 @@ def library() -> C.CDLL:
   lib.mj_getPluginConfig.restype = C.c_char_p
   lib.mj_getPluginConfig.argtypes = [C.c_void_p, C.c_int, C.c_char_p]
   lib.mj_fwdPosition.argtypes = [C.c_void_p, C.c_void_p]
+  lib.mj_fwdActuation.argtypes = [C.c_void_p, C.c_void_p]
   lib.mj_kinematics.argtypes = [C.c_void_p, C.c_void_p]
   lib.mj_comVel.argtypes = [C.c_void_p, C.c_void_p]
   lib.mj_projectConstraint.argtypes = [C.c_void_p, C.c_void_p]

@@ -23,6 +23,19 @@ struct MujocoRod {
   }
   PALPATE double stiffness(int r) const { return datum<double*>(f, DATA_EFC_D)[r]; }
   PALPATE double force(int r) const { return datum<double*>(f, DATA_EFC_FORCE)[r]; }
+  // Lets row `r` have another reference, and give way so many times as much.
+  PALPATE void soften(int r, double softer, double reference) const {
+    double* kbip = datum<double*>(f, DATA_EFC_KBIP) + 4 * r;
+    kbip[1] = 0.0, kbip[0] = kbip[2] = 1.0;
+    datum<double*>(f, DATA_EFC_POS)[r] = datum<double*>(f, DATA_EFC_MARGIN)[r] - reference;
+    scale_impedance(f, {r, 1, false}, softer);
+  }
+  PALPATE double speed(int dof) const { return f.mj.qvel.data[dof]; }
+  // The force on a dof besides bias and constraints.
+  PALPATE double known(int dof) const {
+    return f.mj.qfrc_applied.data[dof] + f.mj.qfrc_passive.data[dof] + f.qfrc_actuator.data[dof];
+  }
+  PALPATE double damping(int dof) const { return f.dof_damping.data[dof]; }
   PALPATE double last_acceleration(int dof) const { return f.qacc_warmstart.data[dof]; }
 
   PALPATE bool moves(int i) const { return f.dofadr.data[i] >= 0; }
@@ -71,7 +84,7 @@ struct MujocoRod {
   // margin, which is taken off again: one that came a step late would find light nodes far inside. Those that
   // slide on geoms are not kept closed: a thread follows by itself, and between jaws the velocity of the last step
   // would take away the force that holds it.
-  PALPATE void note_rows() const {
+  PALPATE void note_rows(double h) const {
     const int nefc = datum<int>(f, DATA_NEFC), ncon = nefc > 0 ? datum<int>(f, DATA_NCON) : 0;
     char* const contacts = datum<char*>(f, DATA_CONTACT);
     note_grips(*this, nefc, datum<int*>(f, DATA_EFC_TYPE));
@@ -95,7 +108,7 @@ struct MujocoRod {
     }
     const int* type = datum<int*>(f, DATA_EFC_TYPE);
     note_joints(*this, nefc, type);
-    yield_trees(*this, nefc, type, datum<int*>(f, DATA_EFC_ID));
+    yield_trees(*this, h, nefc, type, datum<int*>(f, DATA_EFC_ID));
   }
 
   // Reads MuJoCo's arrays: where the step begins, and where it leads with no stiffness.

@@ -1,15 +1,16 @@
 // The coupling of a rod to MuJoCo.
 //
-// The rod's step is taken with the constraints that MuJoCo has found for this step, on bodies that go on as they did
-// but for what they yield to the rod by their inertia, as far as other constraints do not hold them: jaws of 20 g that
-// met the 0.8 kg of a taut thread, its stiffness times h^2, would be thrown off by a force that they never pressed
-// with. So it reaches MuJoCo as a force on its nodes,
+// The rod's step is taken with the constraints that MuJoCo has found for this step, and with the bodies that these
+// reach: they yield to it by their inertia, as far as other constraints do not hold them. Jaws of 20 g that met the
+// 0.8 kg of a taut thread, its stiffness times h^2, would be thrown off by a force that they never pressed with.
+// So the step leads to v1 and to the force f_c of the constraints. Both reach MuJoCo: the rows give way so much that
+// they press with f_c whatever else its solver finds, and the nodes have
 //
-//   qfrc_passive = Mhat (v1 - v) / h - f_ext - f_c,
+//   qfrc_passive = M (v1 - v) / h - f_ext - f_c.
 //
-// with f_c the force of the constraints in the rod's step and Mhat the inertia that one node alone has in it.
-// MuJoCo's solver, for which Mhat is the nodes' inertia, finds f_c again unless other bodies move otherwise; by
-// what it differs the rod then moves on by its own response A. An error of a body of mass M becomes
+// Rows that reach what the rod's step cannot move, such as the nodes of an organ, are FREE: MuJoCo finds their force
+// anew. Then the nodes have in it the inertia Mhat that one node alone has in the rod's step, in place of M, and by
+// what the force differs the rod moves on by its own response A. An error of a body of mass M becomes
 // (A - Mhat) / (M + Mhat) of it, and one of the rod Mhat M / ((M + Mhat) A): so Mhat is that of the direction in
 // which the rod gives way most.
 //
@@ -29,6 +30,7 @@ struct RowOf { Number* value; const int* dof; int count; };
 
 // The first node of the rod that a row reaches, or NOWHERE, or APART: more than two that are neighbours.
 constexpr int NOWHERE = -1, APART = -2;
+constexpr int FREE = -3;  // in place of a tree: of a row whose force MuJoCo finds
 template <class Host, class Row>
 PALPATE int first_node(const Host& host, Row row) {
   int first = -1, last = -1;
@@ -42,14 +44,15 @@ PALPATE int first_node(const Host& host, Row row) {
 }
 
 // A tree of bodies that yields to the rod in its step, by those of its dofs that the rod's constraints reach, up to
-// REACH; others stand still. It does so against its inertia and against the other constraints that held it in the last
-// step: a needle weighs little beside the jaws that hold it. Their other side yields by each of its dofs alone.
+// REACH; others stand still. It does so against its inertia, with damping as MuJoCo's integrators have it, and against
+// the other constraints that held it in the last step: a needle weighs little beside the jaws that hold it. Their other
+// side yields by each of its dofs alone.
 template <class Host>
 struct Tree {
   const Host& host;
   int count = 0, dof[REACH];
   double L[REACH][REACH];  // lower triangle: inertia, then its factor by Cholesky
-  double last[REACH];  // L^-1 of the force that the rod put on it in the last step
+  double change[REACH];  // L^-1 of the force that is known now, less that and the rod's in the last step
 
   PALPATE int find(int d) const {
     for (int k = 0; k < count; ++k)
@@ -69,12 +72,14 @@ struct Tree {
       ++count;
     }
   }
-  PALPATE void weigh() {
-    for (int a = 0; a < count; ++a)
+  PALPATE void weigh(double h) {
+    for (int a = 0; a < count; ++a) {
       for (int k = 0; k < host.f.M_rownnz.data[dof[a]]; ++k) {
         const int at = host.f.M_rowadr.data[dof[a]] + k, b = find(host.f.M_colind.data[at]);
         if (b >= 0) L[a > b ? a : b][a > b ? b : a] = host.M()[at];
       }
+      L[a][a] += h * host.damping(dof[a]);
+    }
   }
   // Adds what row `r` holds it by, where that bore in the last step or does always; returns whether it did.
   PALPATE bool hold_by(int r, bool always) {
@@ -105,7 +110,7 @@ struct Tree {
       if (!tangent) held = hold_by(k, type[k] == IS_EQUALITY);
     }
   }
-  // Factorizes its inertia, and finds what the rod's last force is in its coordinates.
+  // Factorizes its inertia, and finds by what the force on it has changed.
   PALPATE void factorize() {
     for (int a = 0; a < count; ++a)
       for (int b = 0; b <= a; ++b) {
@@ -113,8 +118,9 @@ struct Tree {
         for (int k = 0; k < b; ++k) sum -= L[a][k] * L[b][k];
         L[a][b] = a == b ? sqrt(sum) : sum / L[b][b];
       }
-    for (int a = 0; a < count; ++a) last[a] = host.rod.own.borne.data[dof[a]];
-    solve(last);
+    const auto& rod = host.rod;
+    for (int a = 0; a < count; ++a) change[a] = rod.known.data[dof[a]] - rod.own.pushed.data[dof[a]];
+    solve(change);
   }
   PALPATE void solve(double* x) const {  // by the lower factor
     for (int a = 0; a < count; ++a) {
@@ -203,7 +209,7 @@ PALPATE void note_contact(
   int* tree = host.rod.row_tree.data;  // of all rows alike: a slide's normal may reach what its tangents do not
   int reached = NOWHERE;
   for (int at = before; at < host.rod.count.data[0]; ++at) reached = tree[at] > reached ? tree[at] : reached;
-  for (int at = before; at < host.rod.count.data[0]; ++at) tree[at] = yields ? reached : NOWHERE;
+  for (int at = before; at < host.rod.count.data[0]; ++at) tree[at] = yields ? reached : FREE;
 }
 
 // Notes the rows of equalities, and of limits.
@@ -216,35 +222,46 @@ PALPATE void note_joints(const Host& host, int nefc, const int* type) {
 }
 
 // Lets the tree of bodies that row `first` reaches yield in the rod's step, by coordinates in which its inertia is
-// 1 kg, three to a node. From its last acceleration what the rod did to it is taken off. A tree for which there is no
-// room goes on as it did.
+// 1 kg, three to a node. Without the rod it accelerates as in the last step, but for what the force that is known has
+// changed and for what the rod did. The rows of a tree for which there is no room are free.
 template <class Host>
-PALPATE void yield_tree(const Host& host, int first, int nefc, const int* type, const int* id) {
+PALPATE void yield_tree(const Host& host, int first, double h, int nefc, const int* type, const int* id) {
   const auto& rod = host.rod;
   const int n = rod.count.data[0], tree = rod.row_tree.data[first], node = nodes_of(rod);
-  if (node + REACH / 3 > rod.most_nodes) return;
+  if (node + REACH / 3 > rod.most_nodes) {
+    for (int at = first; at < n; ++at)
+      if (rod.row_tree.data[at] == tree) rod.row_tree.data[at] = FREE;
+    return;
+  }
   Tree<Host> other{host};
   for (int at = first; at < n; ++at)
     if (rod.row_tree.data[at] == tree) other.take(host.row(rod.row_efc.data[at]));
   rod.count.data[3] += (other.count + 2) / 3;
-  other.weigh();
+  other.weigh(h);
   other.hold(nefc, type, id);
   other.factorize();
   for (int at = first; at < n; ++at) {
     if (rod.row_tree.data[at] != tree) continue;
     double* J = rod.row_body.data + REACH * at;
-    other.reach(host.row(rod.row_efc.data[at]), J);
-    for (int a = 0; a < other.count; ++a) rod.row_value.data[(DOFS + 3) * at + DOFS] -= J[a] * other.last[a];
+    const auto row = host.row(rod.row_efc.data[at]);
+    other.reach(row, J);
+    double& rest = rod.row_value.data[(DOFS + 3) * at + DOFS];
+    for (int k = 0; k < row.count; ++k) {
+      const int d = row.dof ? row.dof[k] : k;
+      if (row.value[k] != 0.0 && host.own_dof(d) < 0)
+        rest += row.value[k] * (rod.own.accelerated.data[d] - host.last_acceleration(d));
+    }
+    for (int a = 0; a < other.count; ++a) rest += J[a] * other.change[a];
     rod.row_yields.data[at] = node;
   }
 }
 
 // Lets the bodies that the noted rows reach yield.
 template <class Host>
-PALPATE void yield_trees(const Host& host, int nefc, const int* type, const int* id) {
+PALPATE void yield_trees(const Host& host, double h, int nefc, const int* type, const int* id) {
   const auto& rod = host.rod;
   for (int r = 0; r < rod.count.data[0]; ++r)
-    if (rod.row_tree.data[r] >= 0 && rod.row_yields.data[r] < 0) yield_tree(host, r, nefc, type, id);
+    if (rod.row_tree.data[r] >= 0 && rod.row_yields.data[r] < 0) yield_tree(host, r, h, nefc, type, id);
 }
 
 template <class Rod>
@@ -265,14 +282,44 @@ PALPATE double alone(const Rod& rod, int i, double h) {
   return found > mass ? found : mass;
 }
 
-// Takes the rod's step, and adds the passive force that brings it through MuJoCo's.
+// J a - aref of a row as the rod's step ends.
+template <class Rod>
+PALPATE double residual_of(const Rod& rod, int at, double h) {
+  return RodRow<Rod>{rod, at}.residual(rod.place.data, h);
+}
+
+// Lets MuJoCo's rows press as in the rod's step: each gives way so many times as much, about what it ends with.
+template <class Host>
+PALPATE void freeze(const Host& host, double h) {
+  constexpr double SOFTER = 1e6;
+  const auto& rod = host.rod;
+  for (int at = 0; at < rod.count.data[0]; ++at) {
+    if (rod.row_tree.data[at] == FREE) continue;
+    const int r = rod.row_efc.data[at];
+    host.soften(r, SOFTER, host.reference(r) + (1.0 - SOFTER) * residual_of(rod, at, h));
+  }
+}
+
+// Whether there is a row that is free.
+template <class Rod>
+PALPATE bool is_free(const Rod& rod) {
+  for (int at = 0; at < rod.count.data[0]; ++at)
+    if (rod.row_tree.data[at] == FREE) return true;
+  return false;
+}
+
+// Takes the rod's step, and brings it and its forces through MuJoCo's.
 template <class Host>
 PALPATE void begin(const Host& host, double h) {
   const auto& rod = host.rod;
   host.gather(h);
+  each_lane(0, host.f.nv, [&](int d) {
+    rod.known.data[d] = host.known(d);
+    rod.speed.data[d] = host.speed(d);
+  });
   one_lane([&] {
     rod.count.data[0] = rod.count.data[3] = 0;
-    host.note_rows();
+    host.note_rows(h);
   });
   const int status = step_rod(rod, h);
   ties_energy(rod, rod.place.data, nullptr, nullptr);
@@ -280,11 +327,17 @@ PALPATE void begin(const Host& host, double h) {
   one_lane([&] { rod.status.data[0] = status; });
   if (!ok)  // holds still for this step instead of spreading the damage
     each_lane(0, 3 * rod.nnode, [&](int a) { rod.place.data[a] = rod.start.data[a]; });
+  bool free = false;
   if (touched) {
     const RodMatrix H = matrix_of(rod);
     one_lane([&] { lay_out(rod, rod.place.data); });
     each_lane(0, 4 * nodes_of(rod), [&](int a) { rod.force.data[a] = 0.0; });
     rows_cost(rod, rod.place.data, h, rod.force.data, &H);
+    one_lane([&] { freeze(host, h); });
+    free = is_free(rod);
+  }
+  if (free) {
+    const RodMatrix H = matrix_of(rod);
     // What is not positive is left out: a thread about to buckle gives way at once, and tools would meet nothing.
     assemble(rod, rod.place.data, rod.turn.data, h, rod.gradient.data, false);
     hold(rod, rod.gradient.data, H);
@@ -294,7 +347,7 @@ PALPATE void begin(const Host& host, double h) {
   each_lane(0, rod.nnode, [&](int i) {
     if (!host.moves(i)) return;
     D3 Mhat = host.inertia(i);
-    if (touched) {
+    if (free) {
       const double inertia = alone(rod, i, h);
       host.set_inertia(i, Mhat = {inertia, inertia, inertia});
     }
@@ -335,11 +388,14 @@ PALPATE void break_edge(const Rod& rod) {
   rod.own.twist.data[weakest + 1] = 0.0;
 }
 
-// Keeps the force that the rod puts on other bodies.
+// Keeps what pushed other bodies, and how they accelerated.
 template <class Host>
-PALPATE void note_borne(const Host& host) {
+PALPATE void note_pushed(const Host& host, double h) {
   const auto& rod = host.rod;
-  each_lane(0, host.f.nv, [&](int d) { rod.own.borne.data[d] = 0.0; });
+  each_lane(0, host.f.nv, [&](int d) {
+    rod.own.pushed.data[d] = rod.known.data[d];
+    rod.own.accelerated.data[d] = (host.speed(d) - rod.speed.data[d]) / h;
+  });
   one_lane([&] {
     for (int at = 0; at < rod.count.data[0]; ++at) {
       if (rod.row_tree.data[at] < 0) continue;
@@ -347,18 +403,18 @@ PALPATE void note_borne(const Host& host) {
       const double force = host.force(rod.row_efc.data[at]);
       for (int k = 0; k < row.count && force != 0.0; ++k) {
         const int d = row.dof ? row.dof[k] : k;
-        if (host.own_dof(d) < 0) rod.own.borne.data[d] += row.value[k] * force;
+        if (host.own_dof(d) < 0) rod.own.pushed.data[d] += row.value[k] * force;
       }
     }
   });
 }
 
-// Ends the step: by the rod's own response to what MuJoCo found otherwise.
+// Ends the step: by the rod's own response to what MuJoCo found otherwise, where it could.
 template <class Host>
 PALPATE void end(const Host& host, double h) {
   const auto& rod = host.rod;
-  note_borne(host);
-  if (rod.count.data[0] > 0 && rod.status.data[0] >= 0) {
+  note_pushed(host, h);
+  if (rod.status.data[0] >= 0 && is_free(rod)) {
     each_lane(0, rod.nnode, [&](int i) {
       const D3 found = host.moves(i) ? host.found(i) : D3{0.0, 0.0, 0.0};
       store(rod.move.data + 4 * i, host.moves(i) ? found + load(rod.force.data + 4 * i) : found);

@@ -25,6 +25,18 @@ struct WorldRod {
   PALPATE double reference(int r) const { return f.aref.data[r]; }
   PALPATE double stiffness(int r) const { return f.D.data[r]; }
   PALPATE double force(int r) const { return f.force.data[r]; }
+  PALPATE void soften(int r, double softer, double reference) const {
+    f.D.data[r] /= softer;
+    f.aref.data[r] = reference;
+  }
+  PALPATE double speed(int dof) const { return f.qvel.data[dof]; }
+  // The force on a dof besides bias and constraints.
+  PALPATE double known(int dof) const {
+    return f.qfrc_applied.data[dof] + f.qfrc_passive.data[dof] + f.qfrc_actuator.data[dof];
+  }
+  PALPATE double damping(int dof) const {
+    return f.dof_damping.data[(size_t)(world % f.dof_damping.shape[0]) * f.nv + dof];
+  }
   PALPATE double last_acceleration(int dof) const { return f.qacc_warmstart.data[dof]; }
 
   PALPATE bool moves(int i) const { return f.dofadr.data[i] >= 0; }
@@ -65,7 +77,7 @@ struct WorldRod {
   }
 
   // Notes the rows of constraints that act on the rod, those of contacts first.
-  PALPATE void note_rows() const {
+  PALPATE void note_rows(double h) const {
     const int most = (int)f.aref.shape[1], nefc = f.nefc.data[0] < most ? f.nefc.data[0] : most;
     const int* type = f.type.data;
     note_grips(*this, nefc, type);
@@ -92,7 +104,7 @@ struct WorldRod {
                    geom[0] >= 0 || geom[1] >= 0);
     }
     note_joints(*this, nefc, type);
-    yield_trees(*this, nefc, type, f.id.data);
+    yield_trees(*this, h, nefc, type, f.id.data);
   }
 
   PALPATE void gather(double h) const {
@@ -121,8 +133,8 @@ struct WorldRod {
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
   move_each(world, f.now, f.speed, f.gravity, f.qpos, f.qvel, f.qfrc_applied,
-            f.xfrc_applied, f.qfrc_passive, f.qfrc_smooth, f.qacc, f.qacc_warmstart, f.M, f.nefc, f.type, f.id, f.J,
-            f.J_rownnz, f.J_rowadr, f.J_colind, f.D, f.aref, f.force);
+            f.xfrc_applied, f.qfrc_passive, f.qfrc_smooth, f.qfrc_actuator, f.qacc, f.qacc_warmstart, f.M, f.nefc, f.type,
+            f.id, f.J, f.J_rownnz, f.J_rowadr, f.J_colind, f.D, f.aref, f.force);
   return f;
 }
 
