@@ -81,6 +81,20 @@ def test_a_broken_thread_fails_and_a_test_pulls_at_the_wall_beyond_the_marks():
   assert env.task.outcome == "damage"
 
 
+def test_the_test_of_a_knot_pulls_and_does_not_kick():
+  env = load("extracorporeal_standard")
+  env.reset()
+  physics, task = env.physics, env.task
+  task.free, task.gap = 0.28, 0.0  # closed, and the pull is about to begin
+  for _ in range(4):
+    task.judge(physics)
+    before = physics.nodes()
+    physics.step()
+    # The pull rises by 0.04 N. A step that did not know of it threw the wall up by 3 mm.
+    assert np.linalg.norm(physics.nodes() - before, axis=1).max() < 2e-4
+  assert task.pulled > 0.1
+
+
 def test_batches_refuse_it():
   with pytest.raises(NotVectorisedError, match="rules of Extracorporeal is None"):
     Exercises(num_envs=1, task="suture/extracorporeal_easy", device="cpu")

@@ -144,7 +144,8 @@ def gap(places: np.ndarray, nodes: int) -> float:
 def part(organ: palpate.Organ, nodes: int, force: float) -> None:
   """Lifts the wall on both sides of the stitch and pulls it apart, as a test of the knot.
 
-  Pulled flat, the tube would collapse with a jump.
+  Pulled flat, the tube would collapse with a jump. Between `mj_step1` and `mj_step2` it is to be
+  followed by `mj_forward`.
 
   Args:
     organ: the drain

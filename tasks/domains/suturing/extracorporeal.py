@@ -234,6 +234,7 @@ class Extracorporeal(Task):
     self.free += self.control_timestep
     self.pulled = float(np.clip(_RISES * (self.free - _LET_GO), 0.0, _LAST))
     drain.part(physics.organ, self.scene.nodes, self.pulled)
+    physics.forward()  # or the tissue's next step would not know of it, and throw the wall up
     return 0.95
 
   def tie(self, physics: Physics) -> None:
