@@ -347,6 +347,27 @@ def tears_at(model, data, organ, ends, most, start=0.0):
   raise AssertionError("it has not torn")
 
 
+def test_a_thread_that_turns_in_a_hole_tears_the_sheet_along_its_plane():
+  """Half of its pull is off the sheet, where there is nothing to tear: the hole was lost at once."""
+  nodes = 24
+  one = {"pos": (0.017, 0, 0), "needles": f"needle {ENERGY}", "foundation": 3e7}
+  model, data, organ = load(scene(nodes=nodes, **one))
+  model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # the hole alone
+  drive(model, data, organ, [5.0])
+  data.eq_active[:] = 0
+  below, aside = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
+  torn, way = [], []
+  for _ in pull(model, data, {0: below, nodes - 1: aside}, 0.001, 1.5, 900):
+    if not organ.pinholes:
+      break
+    torn.append(organ.pinholes[0].torn)
+    way.append(organ.pinholes[0].rest)
+  assert organ.error is None
+  assert max(torn) > 2e-3
+  gone = way[-1] - way[0]
+  assert gone[1] > 0.9 * np.linalg.norm(gone)
+
+
 @pytest.mark.parametrize("windows", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_thread_follows_through_a_solid_and_tears_it(windows):
   """Of a bite each pinhole bears G by half the way to the other one."""

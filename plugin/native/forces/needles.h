@@ -407,21 +407,25 @@ CALLED double bears_across(const Fields& f, int i, const Arc& arc, double* s, in
 }
 
 // Lets a hole tear through the tissue by a way against what that bears; returns whether it is one still, rather than torn
-// out of the tissue's edge.
+// out of the tissue's edge. One in a surface tears along that: a thread that turns back in it pulls it off its own plane,
+// where there is nothing to tear.
 template <class Fields>
 CALLED bool tear_by(const Fields& f, Thread t, double* s, int n, D3 way, double bears) {
   double* my = hole(s, n);
-  const D3 from = seat_of_hole(f, s, n).at, to = from + way;
+  const D3 from = seat_of_hole(f, s, n).at;
   int elem = (int)my[HOLE_ELEM];
   D3 w;
   if (kind_of(s, n) == WITHIN) {
-    if (!find_tet(f, t, to, elem, w)) return false;
+    if (!find_tet(f, t, from + way, elem, w)) return false;
     put_seat(my + HOLE_ELEM, elem, w);
   } else {
+    D3 x[3];
+    corners_now(f, elem, x);
+    way = across(way, unit_of(cross(x[1] - x[0], x[2] - x[0])));
     const double misses =
-      find_nearest(f, t, to, elem, w, [](const Fields& g, int e, D3* x) { corners_now(g, e, x); });
+      find_nearest(f, t, from + way, elem, w, [](const Fields& g, int e, D3* x) { corners_now(g, e, x); });
     put_seat(my + HOLE_ELEM, elem, {w.y, w.z, 0.0});
-    if (misses > MISSES * norm(way)) return false;
+    if (misses > MISSES * norm(way) + ENDS * f.edge) return false;
   }
   const double went = norm(seat_of_hole(f, s, n).at - from);
   my[HOLE_TORN] += went;
