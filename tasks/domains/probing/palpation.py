@@ -253,8 +253,10 @@ class Palpate(Task):
     """Returns the place to feel next, None where enough is felt."""
     if p.hasty:
       return self.next if self.next >= 0 else None
-    found = self._unsure(felt)
-    return next(sweep, None) if found is None else found
+    found = self._unsure(felt, _STIFF)
+    if found is None:
+      found = next(sweep, None)
+    return self._unsure(felt) if found is None else found  # nothing was stiff enough in passing
 
   def _left_out(self, felt: dict[int, float]) -> list[int]:
     """Returns the places to sweep over but for those that were felt, from the last of these on."""
@@ -267,13 +269,15 @@ class Palpate(Task):
     order = [*range(first, len(sweep)), *range(first)]
     return [sweep[i] for i in order if not near[i]]
 
-  def _unsure(self, felt: dict[int, float]) -> int | None:
+  def _unsure(self, felt: dict[int, float], stiff: float = 0.0) -> int | None:
     """Returns the place to feel for to be sure of what is stiff, None where nothing is, or all.
+
+    Stiff is what is so many times stiffer than what is soft.
 
     The likeliest of those that nothing near was felt of: what is stiff at an edge of the field
     shows on one side alone.
     """
-    if not felt or max(felt.values()) < _STIFF * _soft(felt):
+    if not felt or max(felt.values()) < stiff * _soft(felt):
       return None
     chance = self._chance(felt)
     spots = self.places[list(felt)]
