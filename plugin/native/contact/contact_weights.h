@@ -192,6 +192,16 @@ PALPATE double ahead(const Fields& f, const char* contact) {
   return 0.0;
 }
 
+// Whether a contact is between a thread and a geom: the thread's step, which may be over by now, sees to its rows.
+template <class Fields>
+PALPATE bool is_threads(const Fields& f, const char* contact) {
+  for (int side = 0; side < 2; ++side) {
+    const int flex = side_of(contact, CONTACT_FLEX, side);
+    if (flex >= 0 && f.flex_dim.data[flex] == 1 && side_of(contact, CONTACT_GEOM, 1 - side) >= 0) return true;
+  }
+  return false;
+}
+
 // Gives contacts with an organ their rows, and flags that what MuJoCo has computed of them for its dual
 // solvers has to be computed again. Done twice it does nothing.
 template <class Fields>
@@ -213,6 +223,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
     const Rows rows = is_mine(f, contact) ? rows_of(f, contact) : Rows{0, 0, false};
     if (!rows.count) continue;
     touched = true;
+    if (is_threads(f, contact)) continue;
     double off = ahead(f, contact);
     const Touch touch = touch_of(f, contact);
     if (touch.geom >= 0) {
