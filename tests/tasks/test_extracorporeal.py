@@ -95,6 +95,19 @@ def test_the_test_of_a_knot_pulls_and_does_not_kick():
   assert task.pulled > 0.1
 
 
+def test_a_thread_that_an_organ_holds_moves_as_mujoco_says():
+  env = load()
+  env.reset()
+  model, data = env.physics.model.ptr, env.physics.data.ptr
+  nodes = [k for k in range(model.nv) if model.body(model.dof_bodyid[k]).name.startswith("thread_")]
+  for _ in range(40):
+    before = data.qvel[nodes].copy()
+    mujoco.mj_step(model, data)
+    moved = data.qvel[nodes] - before
+    # The organ set gaps anew after the thread's step: 1e6 m/s^2, and the ring was pressed with it.
+    np.testing.assert_allclose(model.opt.timestep * data.qacc[nodes], moved, atol=0.02)
+
+
 def test_batches_refuse_it():
   with pytest.raises(NotVectorisedError, match="rules of Extracorporeal is None"):
     Exercises(num_envs=1, task="suture/extracorporeal_easy", device="cpu")
