@@ -348,7 +348,7 @@ def tears_at(model, data, organ, ends, most, start=0.0):
 
 
 def test_a_thread_that_turns_in_a_hole_tears_the_sheet_along_its_plane():
-  """Half of its pull is off the sheet, where there is nothing to tear: the hole was lost at once."""
+  """Half of its pull is off the sheet, where nothing can tear: the hole was lost at once."""
   nodes = 24
   one = {"pos": (0.017, 0, 0), "needles": f"needle {ENERGY}", "foundation": 3e7}
   model, data, organ = load(scene(nodes=nodes, **one))
