@@ -28,7 +28,7 @@ from .contact import contacts, convex
 from .contact.fixed_order import FixedOrder, is_enough
 from .contact.rounding import Rounding
 from .mjw.compiling import compile_ahead
-from .mjw.private import DeterminismType, OverflowType
+from .mjw.private import DeterminismType, OverflowType, uninterpolated
 from .organ import host
 from .organ.organ import Organ
 from .reset import Rest
@@ -260,7 +260,7 @@ class Worlds(Batch):
   def step_tools(self):
     """Launches mujoco_warp's step, with the windows' contacts."""
     each = self._order or self._rounding
-    with each.adding() if each else contextlib.nullcontext():
+    with uninterpolated(), each.adding() if each else contextlib.nullcontext():
       mjw.step(self.m, self.d)
 
   def end(self):

@@ -4,7 +4,16 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any
 
-from mujoco_warp._src import collision_flex, collision_gjk, passive, sensor, solver, support
+import warp as wp
+from mujoco_warp._src import (
+  collision_flex,
+  collision_gjk,
+  passive,
+  sensor,
+  solver,
+  support,
+  warp_util,
+)
 from mujoco_warp._src.collision_core import Geom
 from mujoco_warp._src.collision_gjk import ccd
 from mujoco_warp._src.collision_primitive_core import (
@@ -31,14 +40,13 @@ __all__ = [
   "MJ_MAX_EPAFACES", "MJ_MAX_EPAHORIZON", "ConstraintState", "ConstraintType", "ContactType",
   "DeterminismType", "Geom", "GeomType", "OverflowType", "box_triangle", "capsule_triangle", "ccd",
   "contact_kbimp", "instead", "jac_dof", "passive", "ray_geom", "sensor", "solver",
-  "sphere_triangle", "vec5",
+  "sphere_triangle", "uninterpolated", "vec5",
 ]  # fmt: skip
 
 # Large functions with many callers: inlined, they made kernels of contacts with flexes, of which we
-# need neither interpolated ones nor boxes of rods, and of convex geoms take a minute or two to
-# compile on CUDA.
+# need no boxes of rods, and of convex geoms take a minute or two to compile on CUDA.
 for _each in (
-  support.add_flex_interp_weights, support.contact_bodies_and_weights,
+  support.contact_bodies_and_weights,
   collision_flex._collide_geom_box_rod_detect, collision_flex._collide_geom_capsule_detect,
   collision_flex._collide_geom_triangle_detect, collision_flex._collide_mesh_convex,
   collision_flex._write_candidate, collision_gjk._epa, collision_gjk.ccd, collision_gjk.gjk,
@@ -58,3 +66,25 @@ def instead(changes: list[tuple[Any, str, Any]]) -> Iterator[None]:
   finally:
     for change in kept:
       setattr(*change)
+
+
+_kernels: dict[Any, Any] = {}  # those made within `uninterpolated`
+
+
+@wp.func
+def _add_none(nb: int, body: Any, weight: Any, b: int, w: float):
+  return nb, body, weight
+
+
+def uninterpolated() -> contextlib.AbstractContextManager[None]:
+  """Lets mujoco_warp make and compile kernels within that know no interpolated flexes.
+
+  Each thread of its kernels of contacts with flexes has lists of 64 nodes for them, in slow memory,
+  which it fills whether there are any or not. Slots and threads are never interpolated. Without the
+  lists the Jacobian of contacts takes 0.4 times as long. Kernels that others have of mujoco_warp
+  stay as they are.
+  """
+  return instead([
+    (warp_util, "_KERNEL_CACHE", _kernels),
+    (support, "add_interp_weight", _add_none),
+  ])  # fmt: skip
