@@ -17,10 +17,10 @@ SETTLES = 3.0  # how long an organ is waited for [s]
 _STILL, _LOOK = 1e-7, 0.1
 # What an episode may change in the model.
 _CHANGED = (
-  "body_pos", "body_quat", "cam_fovy", "cam_pos", "cam_quat", "flex_friction", "flex_matid",
-  "flex_rgba", "geom_friction", "light_ambient", "light_diffuse", "light_dir", "light_pos",
-  "light_specular", "mat_rgba", "skin_matid", "skin_rgba", "vis.headlight.ambient",
-  "vis.headlight.diffuse", "vis.headlight.specular",
+  "body_pos", "body_quat", "cam_fovy", "cam_pos", "cam_quat", "eq_data", "eq_obj2id", "eq_solimp",
+  "eq_solref", "flex_friction", "flex_matid", "flex_rgba", "geom_friction", "light_ambient",
+  "light_diffuse", "light_dir", "light_pos", "light_specular", "mat_rgba", "skin_matid",
+  "skin_rgba", "vis.headlight.ambient", "vis.headlight.diffuse", "vis.headlight.specular",
 )  # fmt: skip
 
 

@@ -43,6 +43,8 @@ AFTER |= {
   "suture/extracorporeal_easy": "touch/easy",
   "suture/extracorporeal_standard": "suture/extracorporeal_easy",
   "suture/extracorporeal_hard": "suture/extracorporeal_standard",
+  "suture/knot_easy": "needle/transfer_easy",
+  "suture/knot_standard": "suture/knot_easy",
   "probe/palpate_hard": "probe/palpate_standard",
 }
 RULE = f"{CONSECUTIVE} proficient attempts in a row and {REPEATS} more"

@@ -1,4 +1,4 @@
-"""The scene of `knot` and `extracorporeal`: a slit Penrose drain, and a thread through its marks.
+"""What `knot` and `extracorporeal` share: a slit Penrose drain, and a thread through its marks.
 
 World: z is up, the drain lies on a block along y, and its slit is on top of it. A thread goes in
 through the mark at +x and out at -x, below the slit, along a chord of the drain: straight.
@@ -12,6 +12,7 @@ import palpate
 from palpate.models import mjcf
 
 from ...core import scenes
+from ...core.base import Physics, Task
 from ...core.scenes import BED, ORGAN, Scene
 from .. import sheet
 from .needles import RADIUS as CIRCLE
@@ -37,7 +38,10 @@ _SAMPLES = 4001  # of a section
 # Of vertices that a test pulls at: from the mark, and nearer to the slit, at most [m]; the angle of
 # its pull over the table [rad].
 _NEAR, _EDGE, _LIFT = 0.002, 1e-4, 0.6
-SETTLES = 0.1  # see `Task`: the thread falls meanwhile, until it is laid [s]
+CLOSED = 0.001  # gap of a slit that is [m], as FLS asks for
+STAYS = 0.3  # and is to stay so for so long [s]
+EDGE = 4.5e-4  # of the thread, four of its radii [m]
+PULL = 0.6  # that strands are drawn with [N]
 
 
 @functools.lru_cache(maxsize=8)
@@ -162,3 +166,46 @@ def part(organ: palpate.Organ, nodes: int, force: float) -> None:
     near = body[beyond & (np.linalg.norm(rest - mark, axis=1) < _NEAR)]
     way = np.array([side * np.cos(_LIFT), 0.0, np.sin(_LIFT)])
     data.xfrc_applied[near, :3] = force / len(near) * way
+
+
+class Sewn(Task):
+  """An exercise that draws a throw down on the drain.
+
+  Attributes:
+    gap: of the slit now [m]
+    tension: the largest of the thread [N]
+    broken: whether the thread is
+    whole: whether it is in both of its holes
+  """
+
+  settles = 0.1  # the thread falls meanwhile, until it is laid
+
+  def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Returns all of the drain, and the middle of the stitch."""
+    return np.arange(len(physics.organ.elem)), MIDDLE
+
+  def begin(self, physics: Physics) -> None:
+    """The slit gapes."""
+    self.gap, self.tension = GAPE, 0.0
+
+  def look(self, physics: Physics) -> None:
+    """Finds the gap, the tension, and whether the thread is whole and in its holes."""
+    assert physics.thread
+    self.tension = float(physics.thread.tension.max())
+    self.broken = bool(physics.thread.broken.any())
+    self.whole = len(physics.organ.pinholes) == 2
+    if self.whole:
+      self.gap = gap(physics.nodes(), self.scene.nodes)
+
+  def lost(self, physics: Physics) -> bool:
+    """Returns whether the thread is broken or out of the drain: the exercise has failed then."""
+    if not self.broken and self.whole:
+      return False
+    self.outcome = "damage"
+    self.event(physics, "note", label="thread broken" if self.broken else "torn out of the drain")
+    return True
+
+  def recorded(self, physics: Physics) -> dict[str, float]:
+    """Returns gap, tension and the pull on the drain."""
+    pull = float(np.linalg.norm(physics.organ.needles[0].force))
+    return {"traction": pull, "gap": self.gap, "tension": self.tension}

@@ -31,21 +31,18 @@ import mujoco
 import numpy as np
 from palpate.models import trocar
 
-from ...core.base import Physics, Task
+from ...core.base import Physics
 from ...core.performer import Performer, Script
 from ...core.rules import closeness
 from ...core.scenes import CONTACT, Scene
 from ...metrics import knots
 from ...registry import exercise
 from . import drain
-from .drain import MIDDLE
+from .drain import CLOSED, EDGE, MIDDLE, PULL, STAYS
 
 FIELD = Scene(
   instrument="knot_pusher", port=(0.0, 0.045, 0.11), camera=(0.029, -0.021, 0.033), nodes=400,
 )  # fmt: skip
-CLOSED = 0.001  # gap of a slit that is [m], as FLS asks for
-EDGE = 4.5e-4  # of the thread, four of its radii [m]
-PULL = 0.6  # of each hand outside [N]
 HIGH = 0.010  # of a throw that is laid over what it is to be pushed to [m]
 _HANDS = np.array([0.0, -0.006, 0.026])  # from the stitch to between the hands outside [m]
 _APART = 0.008  # of these [m]
@@ -58,7 +55,6 @@ _TURNS = 121  # points that it is laid with
 _PAST = 6e-4  # from strands that cross over it to between them [m]
 _TOUCH = 1.5 * EDGE  # between nodes of strands that touch [m]
 _SEAT = 0.003  # a throw no higher over the holes is down [m]
-_STAYS = 0.3  # and is to stay there for so long [s]
 _SNUG = 0.0018  # of a strand in a throw that is drawn tight, at most, for each half turn [m]
 _LET_GO = 0.3  # strands lie so long before the knot is tested [s]
 _HOLDS, _LAST, _RISES = PULL, 2.0, 2.0  # pull that it is to hold, the last [N], and the rise [N/s]
@@ -85,10 +81,8 @@ def hard(**kwargs):
   return Extracorporeal(FIELD, **{"turns": (2, 1, 1), **kwargs})
 
 
-class Extracorporeal(Task):
+class Extracorporeal(drain.Sewn):
   """Push throws down with a knot pusher."""
-
-  settles = drain.SETTLES
 
   def __init__(self, scene: Scene, random=None, *, turns: Sequence[int], **kwargs):
     """Makes the task.
@@ -128,12 +122,9 @@ class Extracorporeal(Task):
         geom.solref, geom.solimp[:3] = CONTACT["solref"], CONTACT["solimp"]
     return spec
 
-  def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
-    """Returns all of the drain, and the middle of the stitch."""
-    return np.arange(len(physics.organ.elem)), MIDDLE
-
   def begin(self, physics: Physics) -> None:
     """Lays the first throw, and puts the pusher's ring around the post above it."""
+    super().begin(physics)
     # The way round of the first throw. The pusher takes the post past the tail on the side of +y,
     # where it comes from: a left-handed second throw lies flat so, another one capsizes.
     self.hand = int(self.random.choice([-1, 1])) if self.throws == 1 else 1
@@ -148,8 +139,8 @@ class Extracorporeal(Task):
     }
     self.laid, self.seated, self.stayed, self.free = 1, 0, 0.0, 0.0
     self.high0 = HIGH
-    self.gap = self.left = drain.GAPE  # now, and before the knot was pulled at
-    self.tension = self.below = self.sunk = 0.0
+    self.left = drain.GAPE  # gap before the knot was pulled at
+    self.below = self.sunk = 0.0
     self.slack = False
     self.knot, self.pulled, self.held = "", 0.0, 0.0
     self.stitch, self.throw = MIDDLE, post[1:-1].mean(axis=0)
@@ -160,16 +151,12 @@ class Extracorporeal(Task):
       physics.data.ctrl[physics.model.ptr.actuator(name).id] = force
 
   def look(self, physics: Physics) -> None:
-    """Finds the throw, the gap, the tension, and how far holes are torn."""
-    thread = physics.thread
-    assert thread
-    places = thread.positions
-    self.tension = float(thread.tension.max())
-    self.broken = bool(thread.broken.any())
-    holes = physics.organ.pinholes
-    self.whole = len(holes) == 2
+    """Finds the throw too."""
+    super().look(physics)
     if not self.whole:
       return
+    assert physics.thread
+    places, holes = physics.thread.positions, physics.organ.pinholes
     self.stitch = np.mean([hole.at for hole in holes], axis=0)
     # It slides in its holes: what is outside of them now.
     first, second = sorted(int(-hole.along / EDGE) for hole in holes)
@@ -180,14 +167,11 @@ class Extracorporeal(Task):
     rows = np.flatnonzero(near[: ring + 1].any(axis=1))  # no throw is beyond it
     self.throw = post[rows[-1]] if len(rows) else 0.5 * (post[0] + tail[0])
     self.below = EDGE * max(rows[-1], np.flatnonzero(near[rows[-1]])[0]) if len(rows) else 0.0
-    self.gap = drain.gap(physics.nodes(), self.scene.nodes)
 
   def advance(self, physics: Physics) -> float:
     """Follows the throw down; see the module's head."""
     self.look(physics)
-    if self.broken or not self.whole:
-      self.outcome = "damage"
-      self.event(physics, "note", label="thread broken" if self.broken else "torn out of the drain")
+    if self.lost(physics):
       return -1.0
     high = float(self.throw[2] - self.stitch[2])
     waits = self.laid == self.seated
@@ -195,7 +179,7 @@ class Extracorporeal(Task):
     self.slack = high < _SEAT and self.below - self.sunk > snug
     down = high < _SEAT and self.gap < CLOSED and not self.slack
     self.stayed = self.stayed + self.control_timestep if down and not waits else 0.0
-    if self.stayed > _STAYS - 1e-6:
+    if self.stayed > STAYS - 1e-6:
       self.seated, self.stayed, self.sunk = self.seated + 1, 0.0, self.below
       self.event(physics, "target", self.gap, "throw")
       waits = True
@@ -281,10 +265,10 @@ class Extracorporeal(Task):
     physics.mark(0, self.mark, waits, waits, 0.001)
 
   def recorded(self, physics: Physics) -> dict[str, float]:
-    """Returns gap, tension and the pull on the drain."""
-    pull = float(np.linalg.norm(physics.organ.needles[0].force))
-    gap = self.left if self.pulled else self.gap
-    found = {"traction": pull, "gap": gap, "tension": self.tension}
+    """Returns what the knot held as well, and the gap before it was pulled at."""
+    found = super().recorded(physics)
+    if self.pulled:
+      found["gap"] = self.left
     return found | ({"security": self.held} if self.throws > 1 else {})
 
   def instruct(self, physics: Physics) -> str:
@@ -306,7 +290,7 @@ class Extracorporeal(Task):
       # On a double throw others lock loose: they are let go and drawn tight before they stay.
       loose = 2 if self.turns[0] > 1 and laid > 1 else 0
       for k in range(_TRIES):
-        waits = 0.5 * _STAYS if k < loose else 0.8
+        waits = 0.5 * STAYS if k < loose else 0.8
         yield from _until(p, waits, lambda laid=laid: self.seated == laid)
         if self.seated == laid:
           break

@@ -35,7 +35,7 @@ const GERMAN = {
   // Domains, and the words that levels are made of.
   "touch/": "Berühren", "probe/": "Drücken und Tasten", "trace/": "Nachfahren", "grasp/": "Greifen", "retract/": "Weghalten", "tease/": "Ablösen",
   "dissect/": "Abpräparieren", "cut/": "Schneiden", "bimanual/": "Mit zwei Händen", "navigate/": "Kamera führen", "needle/": "Nadel übergeben", "suture/": "Nähen",
-  "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate": "tasten", "drive": "durchstechen", "running": "fortlaufend", "transfer": "übergeben", "extracorporeal": "Knoten hinunterschieben",
+  "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate": "tasten", "drive": "durchstechen", "running": "fortlaufend", "transfer": "übergeben", "extracorporeal": "Knoten hinunterschieben", "knot": "knoten",
   // What exercises ask for.
   "touch one point within # mm": "berühre einen Punkt auf # mm genau", "touch four points within # mm": "berühre vier Punkte auf # mm genau",
   "touch six points within # mm, on livers that vary": "berühre sechs Punkte auf # mm genau, auf wechselnden Lebern",
@@ -77,6 +77,8 @@ const GERMAN = {
   "drive it within # mm, in changing directions": "stich sie auf # mm genau, in wechselnden Richtungen",
   "drive it within # mm, as FLS asks for, through a tougher wall": "stich sie auf # mm genau, wie FLS es verlangt, durch eine zähere Wand",
   "push one throw down, and close the slit to # mm": "schiebe einen Wurf hinunter und schließe den Schlitz auf # mm",
+  "tie one throw with two needle drivers, and close the slit to # mm": "knüpfe einen Wurf mit zwei Nadelhaltern und schließe den Schlitz auf # mm",
+  "tie a double throw, the first one of a surgeon's knot": "knüpfe einen doppelten Wurf, den ersten eines chirurgischen Knotens",
   "push down two throws, a square knot that holds # N": "schiebe zwei Würfe hinunter, einen Kreuzknoten, der # N hält",
   "push down three throws, the first double, a surgeon's knot that holds # N": "schiebe drei Würfe hinunter, den ersten doppelt, einen chirurgischen Knoten, der # N hält",
   // What runs.
@@ -151,6 +153,11 @@ const GERMAN = {
   "Take the needle's tip with the left hand, and draw it through": "Nimm die Nadelspitze mit der linken Hand und ziehe sie durch",
   "Pull the thread until the cut is closed, and hold it": "Ziehe am Faden, bis der Schnitt zu ist, und halte ihn",
   "Turn the needle about its circle, to the yellow mark": "Drehe die Nadel um ihren Kreis, zur gelben Marke", "Turn it on until the tip is out": "Drehe weiter, bis die Spitze heraus ist",
+  "Take the long tail": "Nimm das lange Ende", "Draw both tails apart until the slit is closed": "Ziehe beide Enden auseinander, bis der Schlitz zu ist",
+  "Wind the long tail once around the other jaws, take the short tail with them, and draw it through":
+    "Wickle das lange Ende einmal um die anderen Backen, nimm das kurze damit und ziehe es hindurch",
+  "Wind the long tail twice around the other jaws, take the short tail with them, and draw it through":
+    "Wickle das lange Ende zweimal um die anderen Backen, nimm das kurze damit und ziehe es hindurch",
   "Slack is left below the throw: lift the pusher a little, and push again": "Unter dem Wurf ist noch loser Faden: hebe den Schieber etwas an und schiebe erneut",
   "Push throw # of # down until the slit is closed": "Schiebe Wurf # von # hinunter, bis der Schlitz zu ist",
   "Take the pusher back up to the yellow mark": "Nimm den Schieber zurück bis zur gelben Marke",
