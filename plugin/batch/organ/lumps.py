@@ -36,7 +36,7 @@ class Map:
 def mix(m: Map, factor: wp.array2d[float], world: wp.array[int], out: wp.array2d[float]):
   """Writes the product of a matrix with the factors of some worlds' triangles."""
   k, i = wp.tid()
-  total = float(0.0)  # noqa: UP018 - a variable to Warp
+  total = float(0.0)
   for q in range(m.adr[i], m.adr[i + 1]):
     total += m.share[q] * factor[k, m.elem[q]]
   out[world[k], i] = total
