@@ -37,7 +37,6 @@ STATES = {
   "line": (WIDE, "#tab-practice", {}),
   "burn": (WIDE, "#tab-practice", {}),
   "phone": (PHONE, "[data-task='trace/easy']", {"right": (0.006, 0.0, 0.0, 0.0, 0.0)}),
-  "phone_home": (PHONE, None, {}),
 }
 STOPPED = ("card",)
 ANSWER = 120e3  # [ms]
