@@ -213,11 +213,15 @@ class Early:
 
 @wp.kernel(enable_backward=False)
 def take_early(f: Early):
-  """Takes margin, and parting on organs, off threads' gaps, see `coupling/mujoco_rod.h`."""
+  """Takes margin, and parting on organs, off threads' gaps, see `coupling/mujoco_rod.h`.
+
+  Contacts of two geoms are told that they have no flex: mujoco_warp leaves what was there.
+  """
   c = wp.tid()
   if c >= f.nacon[0]:
     return
-  if f.geom[c][0] >= 0 and f.geom[c][1] >= 0:  # mujoco_warp leaves their flexes as they were
+  if f.geom[c][0] >= 0 and f.geom[c][1] >= 0:
+    f.flex[c] = wp.vec2i(-1, -1)
     return
   thread = wp.max(f.flex[c][0], f.flex[c][1])
   if thread >= f.nthread:
