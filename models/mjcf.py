@@ -18,8 +18,6 @@ Mesh = tuple[np.ndarray, np.ndarray]  # points (n, 3), triangles (m, 3)
 PLUGIN = "palpate.organ"
 # Keeps MuJoCo from warning of a flex without forces of its own; the plugin sets it to 0.
 EDGE = '<edge damping="1e-9"/>'
-# Of a rigid organ: its windows have the contacts.
-NO_CONTACT: Mapping[str, object] = {"contype": 0, "conaffinity": 0, "selfcollide": "none"}
 _WIDTH = 96
 
 

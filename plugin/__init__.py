@@ -32,6 +32,7 @@ _BROUGHT = {
 _LATER = {
   "add_needle": "needle", "add_organ": "authoring", "add_thread": "thread", "Thread": "thread",
 }  # fmt: skip
+_PACKAGES = ("batch", "models", "tasks")
 
 
 def register() -> int:
@@ -56,10 +57,12 @@ def register() -> int:
 
 
 def __getattr__(name: str):
-  """Brings what is asked for first: what writes scenes, and in the command all."""
+  """Brings what is asked for first: packages, what writes scenes, and in the command all."""
   if name in _BROUGHT:
     register()
     return globals()[name]
+  if name in _PACKAGES:
+    return _importlib.import_module(f".{name}", __name__)
   if name not in _LATER:
     raise AttributeError(f"module 'palpate' has no attribute {name!r}")
   return getattr(_importlib.import_module(f".{_LATER[name]}", __name__), name)

@@ -71,7 +71,7 @@ def sum_up(s: Sensed):
   n = s.count[w]
   s.count[w] = n + 1
   for k in range(s.peak.shape[1]):
-    square = float(0.0)  # noqa: UP018 - a variable to Warp
+    square = float(0.0)
     for i in range(s.adr[k], s.adr[k + 1]):
       square += s.data[w, i] * s.data[w, i]
       s.mean[w, i] = s.mean[w, i] + s.data[w, i]
@@ -314,8 +314,8 @@ def forget(mask: wp.array[bool], row: wp.array[int]):
 def share_freed(damage: wp.array2d[float], area: wp.array[float], out: wp.array[float]):
   """Finds the share of the area of bonds that is free."""
   w = wp.tid()
-  whole = float(0.0)  # noqa: UP018 - a variable to Warp
-  free = float(0.0)  # noqa: UP018
+  whole = float(0.0)
+  free = float(0.0)
   for k in range(area.shape[0]):
     whole += area[k]
     if damage[w, k] >= 1.0:

@@ -17,7 +17,7 @@ from palpate.engine import rods
 from palpate.engine.coupling import Ties
 from palpate.engine.rods import Rod
 from palpate.tissue.kernels import kernel
-from palpate.tissue.types import Array, doubles, fill, floats, ints
+from palpate.tissue.types import Array, also, doubles, fill, floats, ints
 
 from . import base, kernels
 from .contact.contact_rows import Early, take_early
@@ -30,6 +30,9 @@ _EACH = 2  # contacts of an edge with geoms, and as many more of a thread
 _BEYOND = 16
 _OF_DOFS = ("pushed", "accelerated")  # what a state has for each dof
 _LANES = 32  # threads of a world
+# What of these fields are those of `rods.Bound`.
+_OF_BOUND = ("flex", "rest", "dofadr", "qposadr", "bodyid", "massadr", "own_dof", "dof_tree",
+             "geom_tree", "frame", "nv")  # fmt: skip
 _ITERATIONS = 60  # of a step, at most: all worlds wait for the one that takes longest
 
 
@@ -42,25 +45,15 @@ _ITERATIONS = 60  # of a step, at most: all worlds wait for the one that takes l
   contact="dim flex elem geom friction",
   efc="type id J J_rownnz J_rowadr J_colind D aref force",
 )
+@also(rods.Bound, *_OF_BOUND)
 class WorldRods:
   """A thread in all worlds, and mujoco_warp's arrays under their own names."""
 
   rods: Array(Rod, ("nworld",))
-  nv: int
-  flex: int  # its flex
   sparse: int  # whether rows have the columns that they need alone
   falls: int  # whether there is gravity
   timestep: wp.float64
   impratio: wp.float64
-  rest: doubles("nnode", 3)  # rest position in the slides' axes [m]
-  frame: doubles(3, 3)  # rotation from the slides' axes to the world
-  dofadr: ints("nnode")  # first dof of a node, -1 for pinned ones
-  qposadr: ints("nnode")  # its first number in qpos
-  bodyid: ints("nnode")  # its body
-  massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
-  own_dof: ints("nv")  # number of a dof in the rod: three times the node, and the axis; or -1
-  dof_tree: ints("nv")  # tree of bodies that a dof is of
-  geom_tree: ints("ngeom")  # and a geom, -1 if it does not move
   qpos0: floats("nq")
   # What worlds have of their own:
   now: doubles("nworld", "nnode", 3)  # place in the slides' axes [m]

@@ -293,14 +293,11 @@ class _Tissue(Tissue):
     def work(world: int):
       values = {key: value[world] for key, value in rows.items()}
       if "friction" in values:
-        self._rub(world, float(values.pop("friction")))
+        flexes = self.spaces[world].organ.flexes
+        self.batch.models[world].flex_friction[flexes, 0] = float(values.pop("friction"))
       self.handles[world].configure(**values)
 
     self.batch.each(work, worlds)
-
-  def _rub(self, world: int, friction: float):
-    organ = self.spaces[world].organ
-    self.batch.models[world].flex_friction[organ.flexes, 0] = friction
 
 
 class _Thread(base.Thread):

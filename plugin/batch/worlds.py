@@ -292,17 +292,14 @@ class Worlds(Batch):
     self.record()
     return out
 
-  def _after(self):
-    """Launches what follows steps: worlds that are not finite are reset and counted."""
-    self._rest.find()
-
   def record(self):
     """Records the graphs, on a device that has them."""
     with wp.ScopedDevice(self.device):  # where mujoco_warp makes its arrays
       self._record()
 
   def _record(self):
-    work = {"step": self._once, "after": self._after}
+    # After steps worlds that are not finite are reset and counted.
+    work = {"step": self._once, "after": self._rest.find}
     work |= {"reset": self._rest.launch, "look": self._rest.look}
     if not self.device.is_cuda:
       for each in (*self._organs.values(), *self.rods.all.values()):

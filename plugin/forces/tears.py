@@ -54,7 +54,9 @@ class Tears(Force):
       return False
     self.host.launch(_find, self.fields, 1)
     far = self.fields.square.numpy() > (1 + self.host.config.tear) ** 2
-    worlds = [w for w in np.flatnonzero(far).tolist() if not _is_full(opening.mesh(w))]
+    # Where no spare vertex is left nothing opens.
+    meshes = {w: opening.mesh(w) for w in np.flatnonzero(far).tolist()}
+    worlds = [w for w, mesh in meshes.items() if mesh.nouter != mesh.nskin]
     if not worlds:
       return False
     opening.begin(worlds)
@@ -67,10 +69,6 @@ class Tears(Force):
         opened = report.nodes > 0 or opened
     opening.finish()
     return opened
-
-
-def _is_full(mesh: Mesh) -> bool:
-  return mesh.nouter == mesh.nskin
 
 
 def line_of(mesh: Mesh, x: np.ndarray, worst: int, finder: Finder) -> np.ndarray:

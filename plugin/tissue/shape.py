@@ -170,10 +170,11 @@ def arrays(
     out |= solid.arrays(mesh, config, vert, node, out["slot_adr"])
   else:
     out |= solid.none(nslice)
+  area = np.where(vert >= 0, topology.held_areas(mesh)[vert], 0.0).astype(np.float32)
   out |= {
     "vert": vert.astype(np.int32),
     "node": node.astype(np.int32),
-    "area": _node_values(topology.held_areas(mesh), vert),
+    "area": to_slices(area),
     "closed": int(mesh.closed),
     "volume0": topology.volume(mesh.rest, mesh.elem) if mesh.closed else 0.0,
     "unheld": int(not (config.held or config.carrier or mesh.spare or pinned.any())),
@@ -183,10 +184,6 @@ def arrays(
     "number": np.array(list(_numbers(config, mesh.closed).values())),
   }
   return out | counts(out)
-
-
-def _node_values(values: np.ndarray, vert: np.ndarray) -> np.ndarray:
-  return to_slices(np.where(vert >= 0, values[vert], 0.0).astype(np.float32))
 
 
 def counts(values: dict[str, Any]) -> dict[str, int]:

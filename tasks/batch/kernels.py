@@ -356,7 +356,7 @@ def press(b: Between):
     g = b.geom[w, k]
     if g >= 0 and b.side[g] != 0.0:
       n = -wp.vec3(b.normal[w, k, 0], b.normal[w, k, 1], b.normal[w, k, 2])
-      jaw = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+      jaw = int(0)
       axes = b.left[w]
       if b.side[g] < 0.0:
         jaw = 1

@@ -246,12 +246,11 @@ class Exercises(VectorEnv):
       found[name] = found[name][:, 0]
     known = np.ones(self.num_envs, bool) if where is None else where
     if self.task.ranges:
-      found["randomised"] = {n: self._rows(f"drawn_{n}") for n in self.task.ranges}
+      rows = [part.episodes.rows for part in self.parts]
+      found["randomised"] = {
+        name: np.concatenate([each[f"drawn_{name}"] for each in rows]) for name in self.task.ranges
+      }
     return found | {f"_{name}": known for name in INFO}
-
-  def _rows(self, name: str) -> np.ndarray:
-    """Returns what was drawn for the episodes of all worlds."""
-    return np.concatenate([part.episodes.rows[name] for part in self.parts])
 
 
 def _cat(arrays: list[wp.array]) -> Any:

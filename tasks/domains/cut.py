@@ -164,7 +164,7 @@ def nearest(o, place):
 
 @many(nearest)
 def _nearest(o, place):
-  found, least = int(0), float(FAR)  # noqa: RUF046, UP018 - variables to Warp
+  found, least = int(0), float(FAR)
   for k in range(o.count):
     x, y = o.curve[k][0] - place[0], o.curve[k][1] - place[1]
     far = root(x * x + y * y)

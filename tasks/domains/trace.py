@@ -135,7 +135,7 @@ def done(o):
 
 @many(done)
 def _done(o):
-  found = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  found = int(0)
   if o.traced > 0.0:
     for k in range(o.count):
       if o.arc[k] <= o.traced:
@@ -160,7 +160,7 @@ def project(s, o):
 @many(project)
 def _project(s, o):
   middle = max(done(o) - 1, 0)
-  along_curve, off = float(0.0), float(FAR)  # noqa: UP018 - variables to Warp
+  along_curve, off = float(0.0), float(FAR)
   for k in range(max(middle - WINDOW, 0), min(middle + WINDOW, o.count - 1)):
     start = place(s, o, k)
     along = place(s, o, k + 1) - start

@@ -34,7 +34,6 @@ CHANGES = ("jaw", "head")  # ends of components that an actor says as changes: j
 # Ends of offsets [m] that an actor sees on a finer scale too: they begin large and decide small.
 FINELY = ("target", "front", "lead", "trail")
 POWER = 2.0  # an action is what the actor says times its size: slow motion is as clear as fast
-CLONING = 700  # steps of the optimiser of a round, by default
 _BATCH, _RATE = 32, 3e-3  # lessons of a step
 FINE = 0.1  # errors above count by their size, not their square [-]
 _SELDOM = 0.01  # least mean size of a component: what is said seldom counts more [-]
@@ -68,7 +67,7 @@ class Networks:
     groups: names of what is observed by group
     initial_action: what counts as the last action when an episode begins  (naction,)
     lessons: how many it was taught
-    updates: steps of the optimiser that a round of them is learned in
+    start: file name of the policy that it began with, or empty
   """
 
   def __init__(
@@ -100,7 +99,7 @@ class Networks:
     """
     torch.manual_seed(seed)
     self.groups, self.device, self.lessons = grouped(list(shapes), taught, privileged), device, 0
-    self.updates = CLONING
+    self.start = ""
     self._shapes: dict[str, tuple[int, ...]] = dict(shapes)
     self._memory: Any = None
     self._components = list(components)
@@ -213,20 +212,23 @@ class Networks:
 
   # Lessons.
 
-  def learn(self, lessons: Sequence[Lesson], spent: Callable[[], float] = lambda: 0.0) -> float:
+  def learn(
+    self, lessons: Sequence[Lesson], updates: int, spent: Callable[[], float] = lambda: 0.0
+  ) -> float:
     """Learns to do what was done in lessons, and what comes of it; returns the error.
 
     Args:
       lessons: of all rounds
+      updates: steps of the optimiser
       spent: share of the time for it that is over: the learning rate falls in that time, and at 1
         it stops
     """
     self.remember(lessons)
     parameters = [*self._parts(), *self.critic.mlp.parameters()]
     optimiser = torch.optim.Adam(parameters, lr=_RATE)
-    falling = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=self.updates)
+    falling = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=updates)
     losses = []
-    for _ in range(self.updates):
+    for _ in range(updates):
       if (share := spent()) >= 1.0:
         break
       some = self._some()
@@ -237,7 +239,7 @@ class Networks:
       both.backward()
       torch.nn.utils.clip_grad_norm_(parameters, 1.0)
       optimiser.step()
-      falling.last_epoch = min(max(falling.last_epoch, int(share * self.updates)), self.updates - 1)
+      falling.last_epoch = min(max(falling.last_epoch, int(share * updates)), updates - 1)
       falling.step()
       losses.append(loss.detach())
     return float(torch.stack(losses[-_LAST:]).mean()) if losses else math.nan
@@ -327,10 +329,11 @@ class Networks:
     """Returns what was learned as a policy of an exercise."""
     weights = {k: v.detach().cpu().numpy() for k, v in self.actor.state_dict().items()}
     linear = sorted(int(k.split(".")[1]) for k in weights if k.startswith("mlp.") and "weight" in k)
+    begun = {"from": self.start} if self.start else {}
     about = policy.About(
       task.name, tuple(task.components), self.groups[ACTING], task.control_timestep, POWER,
       self._changes, self.initial_action.tolist(), dict(task_kwargs),
-      {"palpate": palpate.__version__, **training}, pixels=self.pixels, fine=self.fine,
+      {"palpate": palpate.__version__, **begun, **training}, pixels=self.pixels, fine=self.fine,
     )  # fmt: skip
     layers = self._encoder(self.actor.encoder.layers if self.pixels else [])
     memory: Any = tuple(weights[f"rnn.rnn.{name}_l0"] for name in _GATES)

@@ -7,8 +7,9 @@ or left-handed. Throws one after the other are their connected sum, with the pro
 from __future__ import annotations
 
 import collections
+import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -59,7 +60,7 @@ def throws(polygon: np.ndarray, most: int = 3) -> tuple[int, ...] | None:
   kinds = (2, -2, 1, -1)
   for count in range(most + 1):
     for each in itertools.combinations_with_replacement(kinds, count):
-      if found == _product([_torus(turns) for turns in each]):
+      if found == functools.reduce(_times, map(_torus, each), {0: 1}):
         return each
   return None
 
@@ -109,13 +110,6 @@ def _torus(turns: int) -> Polynomial:
       out[power + k] = rest[power]
       rest[power + 2] += rest[power]
   return {(-4 if turns > 0 else 4) * power: c for power, c in out.items()}
-
-
-def _product(factors: Sequence[Polynomial]) -> Polynomial:
-  out: Polynomial = {0: 1}
-  for factor in factors:
-    out = _times(out, factor)
-  return out
 
 
 def _times(p: Polynomial, q: Polynomial) -> Polynomial:

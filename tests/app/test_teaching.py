@@ -19,7 +19,7 @@ def give(job):
   return Lesson(ROWS, ROWS, ROWS, taught, ROWS[:, 0], "success", alone=False)
 
 
-def learn(lessons, spent):
+def learn(lessons, updates, spent):
   for _ in range(40):
     if spent() >= 1.0:
       return 0.5
@@ -29,7 +29,7 @@ def learn(lessons, spent):
 
 def school(folder, monkeypatch):
   monkeypatch.setattr(teaching, "give", give)
-  return teaching.School(folder, "touch/easy", {}, seed=0)
+  return teaching.School(folder, "touch/easy", {}, seed=0, updates=10)
 
 
 def teach(found, count, **words):

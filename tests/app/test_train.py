@@ -31,7 +31,7 @@ def train(folder, *words, lessons=0):
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
   monkeypatch.setattr(learning, "LEAST", 48)
-  monkeypatch.setattr(networks, "CLONING", 20)
+  monkeypatch.setattr("palpate.app.learn.train.UPDATES", 20)
   monkeypatch.setattr("palpate.app.learn.train.ROUNDS", 2)
 
 
@@ -95,7 +95,11 @@ def test_lessons_begin_with_the_policy_of_an_easier_exercise(tmp_path, capsys):
   assert cli.main(["train", "touch/standard", "-o", str(tmp_path / "b"), *words]) == 0
   with np.load(tmp_path / "b" / "lessons.npz") as file:
     assert not file["taught"][0]  # it begins
-  assert policy.load(tmp_path / "b" / "policy.safetensors").about.training["from"] == start.name
+  made = tmp_path / "b" / "policy.safetensors"
+  assert policy.load(made).about.training["from"] == start.name
+  more = [*SMALL, "--resume", "--iterations", "1"]
+  assert cli.main(["train", "touch/standard", "-o", str(made.parent), *more]) == 0
+  assert policy.load(made).about.training["from"] == start.name
   capsys.readouterr()
   assert cli.main(["train", "grasp/easy", "-o", str(tmp_path / "c"), *words]) == 2
   assert "from: the policy observes joints" in capsys.readouterr().err
@@ -203,13 +207,12 @@ def test_offsets_are_seen_on_a_finer_scale_which_an_older_policy_begins_without(
     np.testing.assert_allclose(act(step), last, atol=1e-5)
 
 
-def test_what_is_held_from_the_start_is_no_change_to_learn(monkeypatch):
-  monkeypatch.setattr(networks, "CLONING", 200)
+def test_what_is_held_from_the_start_is_no_change_to_learn():
   names, first = ("pitch", "jaw"), (0.0, 0.5)
   task = SimpleNamespace(name="any/easy", components=names, control_timestep=0.02)
   made = networks.Networks({"target": (3,)}, names, 8, (8,), 0.1, 0, "cpu", initial_action=first)
   seen, held = np.ones((1, 3), np.float32), np.float32([first])
-  made.learn(2 * [Lesson(seen, held, held, np.ones(1, bool), seen[:, 0], "success", False)])
+  made.learn(2 * [Lesson(seen, held, held, np.ones(1, bool), seen[:, 0], "success", False)], 200)
   learned = made.policy(task, {}, {})
   assert learned.about.initial_action == list(first)
   assert learned.begin()({"target": seen[0]})[1] == pytest.approx(0.5, abs=0.05)
@@ -219,13 +222,12 @@ def test_jaws_that_are_closed_are_said_past_their_limit():
   names, count, half = ("pitch", "jaw"), 40, 20
   task = SimpleNamespace(name="any/easy", components=names, control_timestep=0.02)
   made = networks.Networks({"target": (3,)}, names, 8, (8,), 0.1, 0, "cpu")
-  made.updates = 200
   seen = np.zeros((count, 3), np.float32)
   seen[half:] = 1.0
   done = np.zeros((count, 2), np.float32)
   done[half:, 1] = -1.0  # they close at once, and stay so
   taught = np.arange(count) != half
-  made.learn(2 * [Lesson(seen, done, done, taught, seen[:, 0], "success", False)])
+  made.learn(2 * [Lesson(seen, done, done, taught, seen[:, 0], "success", False)], 200)
   act = made.policy(task, {}, {}).begin()
   changes = []
   for row in seen:
@@ -235,8 +237,7 @@ def test_jaws_that_are_closed_are_said_past_their_limit():
   assert -0.1 < changes[-1] < -0.01
 
 
-def test_the_learning_rate_falls_in_the_time_there_is(monkeypatch):
-  monkeypatch.setattr(networks, "CLONING", 700)
+def test_the_learning_rate_falls_in_the_time_there_is():
   random = np.random.RandomState(0)
   seen = random.randn(12, 3).astype(np.float32)
   meant = np.tanh(seen[:, :2] * seen[:, 1:])
@@ -245,7 +246,7 @@ def test_the_learning_rate_falls_in_the_time_there_is(monkeypatch):
   for end in (lambda k: float(k >= 60), lambda k: k / 60):
     made = networks.Networks({"target": (3,)}, ("pitch", "yaw"), 16, (16,), 0.1, 0, "cpu")
     steps = itertools.count()
-    errors.append(made.learn(2 * [lesson], lambda end=end, steps=steps: end(next(steps))))
+    errors.append(made.learn(2 * [lesson], 700, lambda end=end, steps=steps: end(next(steps))))
   assert errors[1] < 0.9 * errors[0]
 
 

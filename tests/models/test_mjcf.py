@@ -38,7 +38,8 @@ def test_a_flexcomp_is_the_organ_that_was_asked_for():
 
 def test_a_rigid_organ_and_its_window_are_written_too():
   config = {"window": "w", "mass": 0.4, "device": "cpu"}
-  organ = mjcf.flexcomp("o", MESH, contact=mjcf.NO_CONTACT, rigid=True)
+  bare = {"contype": 0, "conaffinity": 0, "selfcollide": "none"}  # its window has the contacts
+  organ = mjcf.flexcomp("o", MESH, contact=bare, rigid=True)
   window = mjcf.flexcomp(
     "w", contact=mjcf.CONTACT, inside=mjcf.EDGE, type="grid", count=(3, 3, 1), mass=0.01,
     spacing=(0.01, 0.01, 0.01),

@@ -7,6 +7,8 @@ from .surfaces import RADIUS, sphere
 
 FLEX = 0.0005  # radius of the flexes [m]
 PLAIN = {"solref": "0.004 1", "condim": "1"}  # stiff contacts without friction
+# Of a rigid organ: its windows have the contacts.
+NO_CONTACT = {"contype": 0, "conaffinity": 0, "selfcollide": "none"}
 DIGITS = 17  # of numbers in MJCF: all that a double has
 
 
@@ -45,7 +47,7 @@ def windowed(
   """Returns an organ in a body of its own and the flexcomp of its window, `count` slots."""
   keys = plugin(**{"window": grid, "mass": 0.1} | config)
   surface = mjcf.flexcomp(
-    name, (points, elem), contact=mjcf.NO_CONTACT, digits=DIGITS, rigid=True, radius=radius
+    name, (points, elem), contact=NO_CONTACT, digits=DIGITS, rigid=True, radius=radius
   )
   window = mjcf.flexcomp(
     grid, inside=mjcf.EDGE, contact=contacts(contact), type="grid", count=count,

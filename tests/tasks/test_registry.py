@@ -103,3 +103,10 @@ def test_an_attribute_that_begin_forgets_is_named(tmp_path):
   package(tmp_path, "hover", text.replace("goal: int", "goal: int\n  depth: float"))
   done = run(tmp_path, "from palpate import tasks", "tasks.load('hover', 'easy')")
   assert "hover/easy: Hover has no 'depth', which is a field of its state" in done.stderr
+
+
+def test_packages_are_there_with_the_package(tmp_path):
+  done = run(tmp_path, "import palpate", "print(palpate.models.load, palpate.tasks.load)",
+             "palpate.batch.make", "palpate.tusks")  # fmt: skip
+  assert "<function load" in done.stdout
+  assert "module 'palpate' has no attribute 'tusks'" in done.stderr

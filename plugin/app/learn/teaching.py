@@ -75,9 +75,19 @@ class School:
     alone: share that the policy brought to a good end without help where it was let to, last [-]
   """
 
-  def __init__(self, folder: pathlib.Path, task: str, task_kwargs: Mapping[str, Any], seed: int):
-    """Opens a folder, which may have lessons already."""
-    self.path, self.task, self.seed = folder / LESSONS, task, seed
+  def __init__(
+    self, folder: pathlib.Path, task: str, task_kwargs: Mapping[str, Any], seed: int, updates: int
+  ):
+    """Opens a folder, which may have lessons already.
+
+    Args:
+      folder: of the lessons
+      task: such as "touch/easy"
+      task_kwargs: its options
+      seed: of the lessons
+      updates: steps of the optimiser that a round is learned in
+    """
+    self.path, self.task, self.seed, self.updates = folder / LESSONS, task, seed, updates
     self.task_kwargs = json.dumps({"surroundings": "unseen", **task_kwargs})  # it draws nothing
     self.lessons: list[Lesson] = []
     self.rounds, self.seconds, self.alone = 0, 0.0, 0.0
@@ -88,6 +98,11 @@ class School:
   def enough(self) -> bool:
     """Whether the policy needs no more lessons."""
     return self.alone >= _ENOUGH
+
+  @property
+  def taught(self) -> bool:
+    """Whether there is a step to learn from: the policy may have needed no help so far."""
+    return any(lesson.taught.any() for lesson in self.lessons)
 
   def teach(
     self,
@@ -126,15 +141,15 @@ class School:
     if not self.lessons:
       why = "the workers died" if given else "the time was over"
       raise CommandError(f"{self.task}: no lesson was given: {why}", code=1)
-    error = math.nan  # where it needed no help, or not yet
-    if any(lesson.taught.any() for lesson in self.lessons):
+    error = math.nan
+    if self.taught:
       turns, before = itertools.count(1), time.perf_counter() - start
 
       def spent() -> float:
         progress.show(f"round {self.rounds + 1}: learning, step {next(turns)}")
         return 1.0 if over() else (time.perf_counter() - start - before) / (left - before)
 
-      error = networks.learn(self.lessons, spent)
+      error = networks.learn(self.lessons, self.updates, spent)
     progress.clear()
     self.rounds += 1
     self.seconds += time.perf_counter() - start

@@ -37,6 +37,7 @@ _TRAINED = "trained"  # the teacher that comes with an exercise
 _SAVE = 60.0  # seconds between checkpoints
 ROUNDS = 6  # of lessons, at most
 _LESSONS = 96  # of a round
+UPDATES = 700  # of the networks, after each round
 JUDGE = 5  # iterations between looks at the policy without spread
 _LICENCE = """SPDX-License-Identifier: Apache-2.0
 
@@ -54,7 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser):
     "--lessons", metavar="N", type=int, default=_LESSONS,
     help=f"of an expert, in each of {ROUNDS} rounds at most (%(default)s); 0 for practice alone",
   )  # fmt: skip
-  add("--updates", metavar="N", type=int, help="of the networks, after each round (700)")
+  add(
+    "--updates", metavar="N", type=int, default=UPDATES,
+    help="of the networks, after each round (%(default)s)",
+  )  # fmt: skip
   add(
     "--teacher", metavar="FILE", default=_TRAINED,
     help="of a policy of pictures: the policy of the state that it learns from (%(default)s)",
@@ -80,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
   for count in ("iterations", "lessons"):
     if getattr(args, count) < 0:
       raise CommandError(f"{count} is {getattr(args, count)}, expected a whole number >= 0")
-  check_counts(args, *(name for name in ("num_envs", "updates") if getattr(args, name) is not None))
+  check_counts(args, "updates", *(["num_envs"] if args.num_envs is not None else []))
   if not args.minutes > 0:
     raise CommandError(f"minutes is {args.minutes:g}, expected a number > 0")
   crew = workers.chosen(args)
@@ -116,7 +120,7 @@ class Training:
     for path in (folder / learning.CHECKPOINT, folder / LESSONS):
       if path.exists() and not args.resume:
         raise CommandError(f"out has {path.name}, expected --resume or another folder")
-    self.school = School(folder, name, self.kwargs, args.seed)
+    self.school = School(folder, name, self.kwargs, args.seed, args.updates)
     if args.resume and not (self.school.rounds or (folder / learning.CHECKPOINT).exists()):
       raise CommandError(f"out has no {learning.CHECKPOINT} to go on with")
     begun = (folder / learning.CHECKPOINT).exists()
@@ -136,15 +140,27 @@ class Training:
       self.settings.memory, self.settings.hidden, self.settings.spread, args.seed, device, taught,
       privileged, self.task.initial_action,
     )  # fmt: skip
-    self.networks.updates = args.updates or self.networks.updates
-    if self.school.rounds:
+    if self.school.taught:
       self.networks.remember(self.school.lessons)
-    start = folder / policy.FILE if self.school.rounds else args.start
-    if start and not begun:
-      try:
-        self.networks.take(policy.load(start))
-      except ValueError as error:
-        raise CommandError(f"from: {error}") from None
+    self._start(begun)
+
+  def _start(self, begun: bool) -> None:
+    """Starts from the policy in the folder, or another one; what has `begun` has a checkpoint."""
+    from palpate.tasks.learn import policy
+
+    own = self.folder / policy.FILE
+    path = own if begun or self.school.rounds else self.args.start
+    if not path or (begun and not own.exists()):
+      return
+    try:
+      made = policy.load(path)
+      if not begun:
+        self.networks.take(made)
+    except ValueError as error:
+      raise CommandError(f"from: {error}") from None
+    before = made.about.training.get("from", "")
+    self.networks.start = before if path == own else pathlib.Path(path).name
+    if not begun:
       self._write_taught()
 
   def _find_teacher(self, task: Any) -> Policy | None:
@@ -190,7 +206,6 @@ class Training:
         "algorithm": "lessons", "lessons": networks.lessons, "rounds": school.rounds,
         "seconds": round(school.seconds, 1), "seed": self.args.seed,
       }  # fmt: skip
-      training |= {"from": pathlib.Path(self.args.start).name} if self.args.start else {}
       made = networks.policy(self.task, self._told(), training)
       policy.save(self.folder / policy.FILE, made)
       (self.folder / "LICENSE").write_text(_LICENCE, encoding="utf-8")

@@ -99,7 +99,7 @@ def _firm_up(p: Pressed, world: int, c: int):
   what is off its gap, as an acceleration [m/s^2].
   """
   geom = p.contact_geom[c][0]
-  rate = float(0.0)  # noqa: UP018 - a variable to Warp
+  rate = float(0.0)
   R = 1.0 / p.D[world, p.efc_address[c, 0]]
   now = R
   if p.tissue[world, _FIRM] > wp.float64(0.0):
@@ -142,7 +142,7 @@ def parting(
 
   See `parting` of contact/contact_rows.h.
   """
-  square = float(0.0)  # noqa: UP018 - a variable to Warp
+  square = float(0.0)
   for r in range(n - 1):
     if paired == 1:
       v = 0.5 * (aref[world, row[c, 2 * r]] - aref[world, row[c, 2 * r + 1]])
@@ -187,7 +187,7 @@ def press(p: Pressed):
   p.pressed[world, k] = 0.0
   if k >= p.count[world] or not _has_rows(p, c):
     return
-  total = float(0.0)  # noqa: UP018 - a variable to Warp
+  total = float(0.0)
   for r in range(wp.where(p.paired == 1, _rows(p, c), 1)):
     total += p.row_force[world, p.efc_address[c, r]]
   p.geom[world, k] = p.contact_geom[c][0]
@@ -213,11 +213,15 @@ class Early:
 
 @wp.kernel(enable_backward=False)
 def take_early(f: Early):
-  """Takes margin, and parting on organs, off threads' gaps, see `coupling/mujoco_rod.h`."""
+  """Takes margin, and parting on organs, off threads' gaps, see `coupling/mujoco_rod.h`.
+
+  Contacts of two geoms are told that they have no flex: mujoco_warp leaves what was there.
+  """
   c = wp.tid()
   if c >= f.nacon[0]:
     return
-  if f.geom[c][0] >= 0 and f.geom[c][1] >= 0:  # mujoco_warp leaves their flexes as they were
+  if f.geom[c][0] >= 0 and f.geom[c][1] >= 0:
+    f.flex[c] = wp.vec2i(-1, -1)
     return
   thread = wp.max(f.flex[c][0], f.flex[c][1])
   if thread >= f.nthread:

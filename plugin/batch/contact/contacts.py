@@ -295,8 +295,8 @@ def kernel(kinds: frozenset[int], lifts: bool) -> wp.Kernel:
     at.world = world
     at.thread = world * p.nslot + slot
     at.room = 0
-    first = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-    n = int(0)  # noqa: RUF046, UP018
+    first = int(0)
+    n = int(0)
     i = p.slot_node[world, slot]
     if writes:
       if c.many[world, k] == 0:
@@ -350,7 +350,7 @@ def kernel(kinds: frozenset[int], lifts: bool) -> wp.Kernel:
 def count(c: Touch):
   """Adds up the contacts of a world; those beyond its room are missed."""
   world = wp.tid()
-  n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  n = int(0)
   for k in range(c.many.shape[1]):
     n += c.many[world, k]
   c.count[world] = wp.min(n, c.most)

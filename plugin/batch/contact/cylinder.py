@@ -35,8 +35,8 @@ def _beyond(x: wp.vec3, r: float, half: float):
 @wp.func
 def _lowest(a: wp.vec3, b: wp.vec3, r: float, half: float):
   """Returns the point of an edge that is nearest to the cylinder, or deepest in it."""
-  low = float(0.0)  # noqa: UP018 - a variable to Warp
-  high = float(1.0)  # noqa: UP018
+  low = float(0.0)
+  high = float(1.0)
   for _ in range(_HALVINGS):
     t = 0.5 * (low + high)
     _dist, gradient = _beyond(a + t * (b - a), r, half)
@@ -66,8 +66,8 @@ def _under_end(size: wp.vec3, radius: float, a: wp.vec3, b: wp.vec3, d: wp.vec3)
   level = wp.abs(wp.normalize(wp.cross(b - a, d - a))[2]) >= _LEVEL
   slack = _SLACK * size[0]
   middle = wp.vec3(0.0)
-  total = float(0.0)  # noqa: UP018 - a variable to Warp
-  covered = float(0.0)  # noqa: UP018
+  total = float(0.0)
+  covered = float(0.0)
   if level:
     for i in range(_POINTS):
       for j in range(_POINTS - i):

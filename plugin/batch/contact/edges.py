@@ -63,7 +63,7 @@ def lead(p: Patch, accelerated: wp.array2d[float]):
   i = p.slot_node[world, k]
   dof = p.dofadr + 3 * k
   for r in range(3):
-    total = float(0.0)  # noqa: UP018 - a variable to Warp
+    total = float(0.0)
     if i >= 0:
       for c in range(3):
         total += float(p.frame[r, c] / p.h) * p.last[world, i // 8, c, i % 8]

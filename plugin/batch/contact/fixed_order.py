@@ -124,8 +124,8 @@ def _sort_contacts(p: Pairs):
   for k in range(lane, n, lanes):
     c = p.listed[w, k]
     key = _pair_key(p, c)
-    rank = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-    at = int(0)  # noqa: RUF046, UP018
+    rank = int(0)
+    at = int(0)
     for q in range(n):
       other = p.listed[w, q]
       at += wp.where(other < c, 1, 0)
@@ -171,12 +171,12 @@ def _sort_rows(r: Rows):
   npad = r.whole.shape[2]
   for k in range(lane, n, lanes):
     key = _row_key(r, w, k)
-    to = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    to = int(0)
     for q in range(n):
       other = _row_key(r, w, q)
       if other < key or (other == key and q < k):
         to += 1
-    part = int(0)  # noqa: RUF046, UP018
+    part = int(0)
     if r.type[w, k] >= _CONTACT:
       part = k - r.efc_address[r.id[w, k], 0]
     r.part[w, to] = part
@@ -210,7 +210,7 @@ def _bend(
   friction = r.friction[c]
   mu = friction[0] * r.impratio_invsqrt[w % r.impratio_invsqrt.shape[0]]
   dim = wp.min(r.dim[c], n - head)
-  square = float(0.0)  # noqa: UP018 - a variable to Warp
+  square = float(0.0)
   for d in range(1, dim):
     u = Jaref[w, head + d] * friction[d - 1]
     square += u * u
@@ -223,7 +223,7 @@ def _bend(
     own = friction[k - head - 1]
   for i in range(lane, r.whole.shape[2], lanes):
     normal = mu * r.whole[w, head, i]
-    along = float(0.0)  # noqa: UP018
+    along = float(0.0)
     for d in range(1, dim):
       u = Jaref[w, head + d] * friction[d - 1] / t
       along += u * friction[d - 1] * r.whole[w, head + d, i]
@@ -241,7 +241,7 @@ def _weigh(r: Rows, Jaref: wp.array2d[float], w: int, n: int, k: int, lane: int,
   It is D J where the cost is quadratic. On a contact's cone it is C J, with the curvature C of the
   contact's rows; those of a dof's friction have been added to the Hessian's diagonal.
   """
-  weight = float(0.0)  # noqa: UP018 - a variable to Warp
+  weight = float(0.0)
   if r.state[w, k] == _QUADRATIC and r.type[w, k] != _FRICTION:
     weight = r.D[w, k]
   if r.state[w, k - r.part[w, k]] == _CONE:
@@ -275,7 +275,7 @@ def _update(
   for k in range(thread / lanes, n, wp.block_dim() / lanes):
     _weigh(r, Jaref, w, n, k, thread % lanes, lanes)
   meet_block()
-  mine = float(0.0)  # noqa: UP018 - a variable to Warp
+  mine = float(0.0)
   side = r.whole.shape[2] / _SIDE
   for block in range(thread, side * (side + 1) // 2, wp.block_dim()):
     column = int((wp.sqrt(float(8 * block + 1)) - 1.0) * 0.5)
@@ -314,7 +314,7 @@ def _touch(r: Rows, t: Touches):
   site = t.sensor_objid[sensor]
   body = t.site_bodyid[site]
   n = _count(r, w)
-  mine = float(0.0)  # noqa: UP018 - a variable to Warp
+  mine = float(0.0)
   for k in range(lane, n, wp.block_dim()):
     if r.type[w, k] >= _CONTACT and r.part[w, k] == 0:
       c = r.id[w, k]
@@ -356,7 +356,7 @@ def _compensation(deterministic: bool) -> wp.Kernel:
     w, thread, i = wp.tid()
     if thread > 0:
       return
-    total = float(0.0)  # noqa: UP018 - a variable to Warp
+    total = float(0.0)
     for b in range(1, share.shape[1]):
       borne = share[w % share.shape[0], b] * mass[w % mass.shape[0], b]
       if borne != 0.0 and isdofancestor[b, i] != 0:

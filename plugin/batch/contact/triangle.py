@@ -55,7 +55,7 @@ def _between(p: wp.vec3, d: wp.vec3, q: wp.vec3, e: wp.vec3):
   dd, ee, de = wp.dot(d, d), wp.dot(e, e), wp.dot(d, e)
   dr, er = wp.dot(d, r), wp.dot(e, r)
   apart = dd * ee - de * de
-  s = float(0.5)  # noqa: UP018 - a variable to Warp
+  s = float(0.5)
   if apart > 1e-6 * dd * ee:
     s = wp.clamp((de * er - dr * ee) / apart, 0.0, 1.0)
   t = wp.clamp((de * s + er) / ee, 0.0, 1.0)

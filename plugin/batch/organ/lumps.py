@@ -36,7 +36,7 @@ class Map:
 def mix(m: Map, factor: wp.array2d[float], world: wp.array[int], out: wp.array2d[float]):
   """Writes the product of a matrix with the factors of some worlds' triangles."""
   k, i = wp.tid()
-  total = float(0.0)  # noqa: UP018 - a variable to Warp
+  total = float(0.0)
   for q in range(m.adr[i], m.adr[i + 1]):
     total += m.share[q] * factor[k, m.elem[q]]
   out[world[k], i] = total
@@ -60,15 +60,12 @@ class Lumps:
     lump = body.fields.lump
     if not (body.is_solid or organ.mesh.spare):
       lump.hinge_left.assign(_left(organ, body))
-    self._maps = [
-      (self._put(map), _rows(self.node if name == "node" else getattr(lump, name)))
-      for name, map in maps.items()
-    ]
+    self._maps = []
+    for name, map in maps.items():
+      out = self.node if name == "node" else getattr(lump, name)
+      values = {"adr": map.indptr, "elem": map.indices, "share": map.data}
+      self._maps.append((fill(Map, self._device, values), out.reshape((out.shape[0], -1))))
     self.put(np.arange(body.nworld), np.ones((1, self._nelem), np.float32))
-
-  def _put(self, matrix: sparse.csr_matrix):
-    values = {"adr": matrix.indptr, "elem": matrix.indices, "share": matrix.data}
-    return fill(Map, self._device, values)
 
   def put(self, worlds: np.ndarray, factors: np.ndarray):
     """Gives some worlds the factors of their triangles, (worlds, nelem), or (1, nelem) for all."""
@@ -78,10 +75,6 @@ class Lumps:
     for map, out in self._maps:
       dim = (len(worlds), out.shape[1])
       wp.launch(mix, dim=dim, inputs=[map, given, rows, out], device=self._device)
-
-
-def _rows(array: wp.array) -> wp.array:
-  return array.reshape((array.shape[0], -1))
 
 
 def _around(mesh, body) -> sparse.csr_matrix:

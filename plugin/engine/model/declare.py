@@ -29,6 +29,8 @@ NO_RK4 = (
   "integrator is RK4, which evaluates forces four times a step; expected Euler, implicit or "
   "implicitfast"
 )
+# Equalities of a flex's own edges.
+_EDGES = [int(getattr(mujoco.mjtEq, f"mjEQ_{name}")) for name in ("FLEX", "FLEXVERT", "FLEXSTRAIN")]
 _FLAT = 1e-6  # volume that counts as none, as a share of the area to the power of 1.5
 _CACHED = 16
 _made: dict[bytes, Declaration] = {}
@@ -365,6 +367,12 @@ def check_flex(m, flex: int, name: str):
     raise ValueError(
       f"organ {name!r}: flexcomp has MuJoCo elasticity too, expected no <elasticity young='...'> "
       "and no <edge stiffness='...'>; use the plugin's keys"
+    )
+  kinds, firsts = (mjstruct.view(a, m.neq, np.int32) for a in (m.eq_type, m.eq_obj1id))
+  if np.any(np.isin(kinds, _EDGES) & (firsts == flex)):
+    raise ValueError(
+      f"organ {name!r}: an equality of MuJoCo holds the flex's edges, expected none and no "
+      "<edge equality='...'>; use the plugin's keys"
     )
 
 

@@ -88,7 +88,6 @@ struct WorldRod {
       const bool paired = type[r] == CONTACT_PYRAMIDAL;
       count = paired ? 2 * (dim - 1) : dim;
       const int *flex = (const int*)f.contact_flex.data + 2 * c, *geom = (const int*)f.contact_geom.data + 2 * c;
-      if (geom[0] >= 0 && geom[1] >= 0) continue;  // mujoco_warp leaves their flexes as they were
       if ((flex[0] != f.flex && flex[1] != f.flex) || r + count > nefc) continue;
       if (is_open(*this, flex, (const int*)f.contact_elem.data + 2 * c, geom)) {
         // mujoco_warp still has it

@@ -59,19 +59,15 @@ def cuttable(surface: Mesh, solid: Mesh) -> Mesh:
       )
     at[part] = fits
   corner = corner[at]
-  mesh = dataclasses.replace(
-    mesh, **{name: _wider(getattr(mesh, name)) for name in ("ring", "ring_elem")}
-  )
+  more = np.full((len(mesh.ring), MORE), -1)
+  rings = {name: np.hstack([getattr(mesh, name), more]) for name in ("ring", "ring_elem")}
+  mesh = dataclasses.replace(mesh, **rings)
   # The first corner stays, where it can.
   turn = (tet.ravel()[corner] == elem[:, :1]).argmax(axis=1)
   corner = np.take_along_axis(corner, (turn[:, None] + np.arange(3)) % 3, axis=1)
   elem = tet.ravel()[corner]
   twin = build("solid", surface.rest, elem, spare).twin
   return dataclasses.replace(mesh, elem=elem, twin=twin, of_tet=corner, mate=mate)
-
-
-def _wider(ring: np.ndarray) -> np.ndarray:
-  return np.hstack([ring, np.full((len(ring), MORE), -1)])
 
 
 def room(mesh: Mesh) -> np.ndarray:

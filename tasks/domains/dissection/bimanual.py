@@ -146,7 +146,7 @@ def divide(s, o):
 
 @many(divide)
 def _divide(s, o):
-  found = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  found = int(0)
   for k in range(bonds(s)):
     far = strand_distance(s, k, other_point(s, o.heel), other_point(s, o.toe))
     if far < o.reach and not is_free(s, k):
@@ -178,7 +178,7 @@ def nearest(s):
 
 @many(nearest)
 def _nearest(s):
-  found, least = int(0), float(FAR)  # noqa: RUF046, UP018 - variables to Warp
+  found, least = int(0), float(FAR)
   for k in range(bonds(s)):
     far = length(bond(s, k) - other_tip(s))
     if far < least and not is_free(s, k):

@@ -82,7 +82,7 @@ def held(s) -> np.ndarray:
 
 def holding(s):
   """Returns how many bonds hold."""
-  found = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  found = int(0)
   for k in range(bonds(s)):
     if not is_free(s, k):
       found += 1

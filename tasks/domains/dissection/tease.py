@@ -90,7 +90,7 @@ def front(s):
 
 @many(front)
 def _front(s):
-  every, low, high, found = holding(s) == 0, float(FAR), float(0.0), float(0.0)  # noqa: UP018
+  every, low, high, found = holding(s) == 0, float(FAR), float(0.0), float(0.0)
   for k in range(bonds(s)):
     if every or not is_free(s, k):
       low = min(low, bond(s, k)[1])

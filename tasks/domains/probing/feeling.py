@@ -114,7 +114,7 @@ def nearest(o, point):
 
 @many(nearest)
 def _nearest(o, point):
-  k = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  k = int(0)
   for i in range(o.places.shape[0]):
     if length(o.places[i] - point) < length(o.places[k] - point):
       k = i
@@ -128,7 +128,7 @@ def stiffest(o):
 
 @many(stiffest)
 def _stiffest(o):
-  top = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  top = int(0)
   for i in range(o.stiffness.shape[0]):
     if o.stiffness[i] > o.stiffness[top]:
       top = i
@@ -143,19 +143,19 @@ def soft(o):
 
 @many(soft)
 def _soft(o):
-  count = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  count = int(0)
   for i in range(o.stiffness.shape[0]):
     if o.stiffness[i] > 0.0:
       count += 1
   for i in range(o.stiffness.shape[0]):
-    own, below = o.stiffness[i], int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    own, below = o.stiffness[i], int(0)
     for j in range(o.stiffness.shape[0]):
       other = o.stiffness[j]
       if other > 0.0 and (other < own or (other == own and j < i)):
         below += 1
     if own > 0.0 and below == int(SOFT * float(count - 1)):
       return own
-  return float(0.0)  # noqa: UP018
+  return float(0.0)
 
 
 def new(o, place, apart):
@@ -169,8 +169,8 @@ def new(o, place, apart):
 
 @many(new)
 def _new(o, place, apart):
-  found = int(-1)  # noqa: RUF046, UP018 - variables to Warp
-  least = float(0.0)  # noqa: UP018
+  found = int(-1)
+  least = float(0.0)
   for k in range(o.places.shape[0]):
     away = length(o.places[k] - place)
     if found < 0 or away < least:
@@ -221,7 +221,7 @@ def expected(o, low):
 
 @many(expected)
 def _expected(o, low):
-  best, mass, square = float(0.0), float(0.0), float(0.0)  # noqa: UP018 - variables to Warp
+  best, mass, square = float(0.0), float(0.0), float(0.0)
   sum = wp.vec3()
   for k in range(o.places.shape[0]):
     best = max(best, _gain(o, k, low))
@@ -237,7 +237,7 @@ def _expected(o, low):
 
 def _gain(o, k, low):
   """Returns what the best bell on a place takes off the sum of squares, see `chance`."""
-  both, square = float(0.0), float(LEAST)  # noqa: UP018 - variables to Warp
+  both, square = float(0.0), float(LEAST)
   for j in range(o.places.shape[0]):
     if o.stiffness[j] > 0.0:
       ratio = length(o.places[j] - o.places[k]) / (WIDTH * o.radius)

@@ -73,7 +73,7 @@ def touch(o, here):
 
 @many(touch)
 def _touch(o, here):
-  count = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  count = int(0)
   for k in range(o.places.shape[0]):
     if length(o.places[k] - here) < FELT:
       o.touched[k] = 1

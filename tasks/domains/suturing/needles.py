@@ -74,7 +74,7 @@ def arc(s, share):
 
 def away(s, place):
   """Returns how far a place is from the needle's nearest piece [m]."""
-  least = float(1.0)  # noqa: UP018 - a variable to Warp
+  least = float(1.0)
   for k in range(PIECES + 1):
     least = min(least, length(arc(s, float(k) / float(PIECES)) - place))
   return least
@@ -109,7 +109,7 @@ def open_holes(s, o, count):
     o.misses[k] = root(off[0] * off[0] + off[1] * off[1])
     reach(s, o, o.misses[k])
   o.holes = count
-  worst = float(0.0)  # noqa: UP018 - a variable to Warp
+  worst = float(0.0)
   for k in range(count):
     worst = max(worst, o.misses[k])
   return o, worst

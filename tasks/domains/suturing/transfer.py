@@ -158,7 +158,7 @@ def from_first(s, o, share):
 
 def crossing(s, o):
   """Returns what share of the needle is through the ring, -1 where no piece is in it."""
-  found = float(-1.0)  # noqa: UP018 - a variable to Warp
+  found = float(-1.0)
   middle, way = o.middles[now(o)], o.ways[now(o)]
   before = from_first(s, o, 0.0) - middle
   for k in range(PIECES):

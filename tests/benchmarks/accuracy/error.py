@@ -254,7 +254,10 @@ def finding(rows: list[Row]) -> list[str]:
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Draws the figures and writes the page."""
   drawn = draw(rows, out)
-  page = results.page(out / "error.md", "Run time against error", about, summarize(rows),
+  lines = summarize(rows)
+  for path in drawn[1:]:
+    lines += [f"![Run time against error, {path.stem.removeprefix('error_')}]({path.name})", ""]
+  page = results.page(out / "error.md", "Run time against error", about, lines,
                       finding(rows), drawn[0] if drawn else None)  # fmt: skip
   return [*drawn, page]
 

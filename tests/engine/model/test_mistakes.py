@@ -67,6 +67,8 @@ def test_flexes_that_are_no_surface_are_refused(scenes):
   elastic = '<elasticity young="1e3" poisson="0.3" thickness="0.01" elastic2d="both"/>'
   xml = scenes.world(f"{flex}>{plugin}{elastic}</flexcomp>")
   _refused(xml, "organ 'sheet'", "MuJoCo elasticity too")
+  xml = scenes.world(f'{flex}>{plugin}<edge equality="true"/></flexcomp>')
+  _refused(xml, "organ 'sheet'", "holds the flex's edges", "expected none")
 
 
 def test_a_plugin_on_a_body_without_a_flex_is_refused(scenes):

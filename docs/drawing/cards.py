@@ -1,7 +1,7 @@
 """Draws the pictures of the home page: each exercise after its expert has worked for some time.
 
-python docs/draw_cards.py            # all
-python docs/draw_cards.py grasp cut  # those with one of these words in their name
+python docs/drawing/cards.py            # all
+python docs/drawing/cards.py grasp cut  # those with one of these words in their name
 """
 
 import pathlib
@@ -12,7 +12,7 @@ import mujoco
 from palpate import tasks
 from palpate.tasks.core import performer
 
-FOLDER = pathlib.Path(__file__).parents[1] / "plugin/app/live/page/static/cards"
+FOLDER = pathlib.Path(__file__).parents[2] / "plugin/app/live/page/static/cards"
 SIZE, SECONDS = (250, 400), 1.0
 # Levels that begin alike are drawn where their last throw waits over the others.
 LATER = {"suture_extracorporeal_standard": 2.3, "suture_extracorporeal_hard": 4.3}

@@ -1,7 +1,7 @@
 """Writes the moving picture of the README, a film with fewer frames.
 
 palpate exercise dissect/easy --film dissect.mp4 --size 1280x960
-python docs/moving_picture.py dissect.mp4 docs/pictures/dissect_easy.webp
+python docs/drawing/moving_picture.py dissect.mp4 docs/pictures/dissect_easy.webp
 """
 
 import sys

@@ -51,4 +51,4 @@ with mujoco.Renderer(model, 1280, 1280) as renderer:
   pictures.append(picture(renderer, 0.0045))
 image = Image.fromarray(np.concatenate(pictures, axis=1))
 image = image.resize((1280, 640), Image.Resampling.LANCZOS)
-image.save(pathlib.Path(__file__).parent / "pictures" / "knot.webp", quality=85)
+image.save(pathlib.Path(__file__).parents[1] / "pictures" / "knot.webp", quality=85)

@@ -2,7 +2,7 @@
 # pyright: reportAttributeAccessIssue=false
 """Draws MuJoCo's pictures of exercises beside those of a batch's camera, and how well they agree.
 
-python docs/picture_pairs.py
+python docs/drawing/pairs.py
 
 Experts act for some seconds; then both draw the same state. Pairs go to docs/pictures, and the
 table between the page's two comments is written anew.
@@ -18,7 +18,7 @@ import palpate.batch
 from palpate.tasks import suite
 from palpate.tasks.core import performer, scenes
 
-PAGE = pathlib.Path(__file__).with_name("pixels.md")
+PAGE = pathlib.Path(__file__).parents[1] / "pixels.md"
 SIZE = 640  # [pixels]
 # Exercises, and for how long their experts act [s].
 SHOWN = {"grasp/easy": 4.0, "cut/easy": 8.0, "dissect/easy": 6.0, "trace/easy": 3.0}

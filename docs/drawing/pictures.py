@@ -1,7 +1,7 @@
 """Draws the pages' pictures anew, each by the command that stands beside it.
 
-python docs/draw_pictures.py            # all
-python docs/draw_pictures.py grasp cut  # those with one of these words in their path
+python docs/drawing/pictures.py            # all
+python docs/drawing/pictures.py grasp cut  # those with one of these words in their path
 """
 
 import pathlib
@@ -10,7 +10,7 @@ import shlex
 import subprocess
 import sys
 
-FOLDER = pathlib.Path(__file__).parent
+FOLDER = pathlib.Path(__file__).parents[1]
 COMMAND = r"`(?:palpate (render [^`]+)|python (docs/[^`]+))`"
 PICTURE = re.compile(r"!\[[^]]*\]\(([^)]+)\)\s*\|?\s*" + COMMAND)
 

@@ -1,7 +1,7 @@
 """Draws the states of the page of `palpate serve` in a browser, and a film's picture beside one.
 
-python docs/draw_page.py            # all
-python docs/draw_page.py home card  # some
+python docs/drawing/page.py            # all
+python docs/drawing/page.py home card  # some
 
 It needs Chromium and playwright, and says so where they are not there. Without a graphics card a
 state takes half a minute.
@@ -16,7 +16,7 @@ import threading
 import imageio.v3 as imageio
 import numpy as np
 
-FOLDER = pathlib.Path(__file__).with_name("pictures")
+FOLDER = pathlib.Path(__file__).parents[1] / "pictures"
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 WIDE, PHONE = (1280, 800), (390, 844)
 # State -> size, what is clicked, and how hands move then: right, up, back [m], roll [rad], camera.
@@ -37,7 +37,6 @@ STATES = {
   "line": (WIDE, "#tab-practice", {}),
   "burn": (WIDE, "#tab-practice", {}),
   "phone": (PHONE, "[data-task='trace/easy']", {"right": (0.006, 0.0, 0.0, 0.0, 0.0)}),
-  "phone_home": (PHONE, None, {}),
 }
 STOPPED = ("card",)
 ANSWER = 120e3  # [ms]
