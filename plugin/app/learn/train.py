@@ -139,7 +139,8 @@ class Training:
     self.networks.updates = args.updates or self.networks.updates
     if self.school.rounds:
       self.networks.remember(self.school.lessons)
-    start = folder / policy.FILE if self.school.rounds else args.start
+    own = folder / policy.FILE
+    start = own if self.school.rounds and own.exists() else args.start
     if start and not begun:
       try:
         self.networks.take(policy.load(start))
@@ -173,10 +174,13 @@ class Training:
     if self.teacher or (self.folder / learning.CHECKPOINT).exists():  # it practises already
       return True
     count, gamma, until = self.args.lessons, self.settings.gamma, 60 * self.args.minutes
-    while count and school.rounds < ROUNDS and not school.enough and school.seconds < until:
-      if not school.teach(networks, crew, count, gamma, interrupt, until):
+    while count and school.rounds < ROUNDS and not school.ends(until):
+      before = school.rounds
+      whole = school.teach(networks, crew, count, gamma, interrupt, until)
+      if school.rounds > before:
+        school.save()
+      if not whole:
         return False
-      school.save()
       self._write_taught()
     return not interrupt.seen
 
