@@ -149,8 +149,8 @@ class Training:
     from palpate.tasks.learn import policy
 
     own = self.folder / policy.FILE
-    path = own if begun or self.school.rounds else self.args.start
-    if not path or (begun and not own.exists()):
+    path = own if (begun or self.school.rounds) and own.exists() else self.args.start
+    if not path:
       return
     try:
       made = policy.load(path)
@@ -189,10 +189,13 @@ class Training:
     if self.teacher or (self.folder / learning.CHECKPOINT).exists():  # it practises already
       return True
     count, gamma, until = self.args.lessons, self.settings.gamma, 60 * self.args.minutes
-    while count and school.rounds < ROUNDS and not school.enough and school.seconds < until:
-      if not school.teach(networks, crew, count, gamma, interrupt, until):
+    while count and school.rounds < ROUNDS and not school.ends(until):
+      before = school.rounds
+      whole = school.teach(networks, crew, count, gamma, interrupt, until)
+      if school.rounds > before:
+        school.save()
+      if not whole:
         return False
-      school.save()
       self._write_taught()
     return not interrupt.seen
 

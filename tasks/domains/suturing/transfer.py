@@ -96,6 +96,7 @@ _BACK, _RISE = 0.014, 0.016  # out of a ring, and off the needle [m]
 # Of a teacher: width of the cone over a goal, at its tip [m] and by height [-], how far a frame may
 # be turned there [rad], height that jaws close from, and how far off a hand has let go [m].
 _NARROW, _CONE, _TURNED, _CLOSES, _CLEAR = 0.0015, 0.2, 0.2, 0.002, 0.02
+_FREE = 0.002  # how high a needle is before a ring that may be put right there [m]
 
 
 @exercise("needle/transfer_easy", 25, "easy", "bimanual")
@@ -350,7 +351,7 @@ class Transfer(Needlework):
   def _drive(self, p: Performer) -> Script:
     """Brings the end that goes first to the ring, and turns it through as far as to be taken."""
     ring, sign = now(self), -1.0 if back(self) else 1.0
-    if not self.through:
+    if not self.through and not _begun(p, self):
       place, mat = entrance(self, ring)
       if ring:  # out of the ring before
         pos, turned = needle(p.physics)
@@ -360,11 +361,11 @@ class Transfer(Needlework):
           out = pos - sign * left * self.ways[ring - 1]
           yield from carry(p, lambda t: (out, turned))
       way = sign * self.ways[ring]
-      clear = place - _BACK * way
+      clear = place - min(_height(p, needle(p.physics), (place, mat), -way), _BACK) * way
       yield from _come(
         carry(p, lambda t: (clear, mat)), lambda: _over(p, needle(p.physics), (place, mat), -way)
       )
-      yield from carry(p, lambda t: (place, mat))
+      yield from _come(carry(p, lambda t: (place, mat)), lambda: _begun(p, self))
     start, end = turn_of(self, p.physics), -QUARTER - sign * _HANDS
     yield from carry(p, lambda t: posed(self, ring, start + t * (end - start)), end - start)
 
@@ -424,6 +425,8 @@ def park(task: Transfer, port: Any, middle: np.ndarray) -> Pose:
 
 def _let_go(task: Transfer, p: Performer) -> Script:
   """Opens the jaws and takes the hand aside."""
+  if p.hasty:  # from where another has come to
+    p.extra[:] = p.share()
   yield from jaws(p, WIDE)
 
   def gone() -> bool:
@@ -450,6 +453,27 @@ def _over(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> bool:
   aside = float(np.linalg.norm(off - high * up))
   far = aside > _NARROW + _CONE * max(high, 0.0) or apart(pose[1], goal[1]) > _TURNED
   return p.hasty and -2 * _NARROW < high < 2 * _RISE and not far
+
+
+def _begun(p: Performer, task: Transfer) -> bool:
+  """Returns whether a teacher's needle may turn into the ring from where it is."""
+  (pos, mat), turn, sign = needle(p.physics), turn_of(task, p.physics), -1.0 if back(task) else 1.0
+  place, turned = posed(task, now(task), turn)
+  way = sign * (turn + QUARTER) + QUARTER + _ENTERS
+  there = float(np.linalg.norm(pos - place)) < _NARROW and apart(mat, turned) < _TURNED
+  return p.hasty and there and -_TURNED < way < 2 * _ENTERS
+
+
+def _height(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> float:
+  """Returns how high over a goal a pose is put right [m].
+
+  A teacher goes back no further than it must. Who learns from one that goes all of the way back, or
+  none of it, goes to and fro before the goal.
+  """
+  off = pose[0] - goal[0]
+  aside = float(np.linalg.norm(off - (off @ up) * up))
+  turned = apart(pose[1], goal[1]) / _TURNED
+  return max(aside - _NARROW, 0.0) + _FREE * max(turned, 1.0) if p.hasty else math.inf
 
 
 def _lingers(p: Performer) -> bool:
