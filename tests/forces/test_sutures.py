@@ -127,8 +127,8 @@ def test_a_thread_goes_through_both_layers_of_a_wall_and_tears_the_weaker_one():
   drive(model, data, organ, [5.0])
   assert organ.pinholes[0].thread and lower.pinholes[0].thread
   data.eq_active[:] = 0
-  aside = np.array([0.0, 1.0, 0.0])
-  ends = {0: aside, nodes - 1: aside}
+  aside, apart = np.array([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 0.0])
+  ends = {0: aside + apart, nodes - 1: aside - apart}  # a hairpin would rest on a node, to and fro
   for _ in pull(model, data, ends, 0.001, 0.3, 300):
     pass
   (hole,) = tears_at(model, data, lower, ends, 1.1, start=0.3)
