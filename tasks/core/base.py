@@ -296,6 +296,10 @@ class Task(engine.Task):
     """Returns the radius of a mark [m]."""
     return self.mark_radius
 
+  def harsh(self, physics: Physics) -> bool:
+    """Returns whether somebody should step in: what is done now does harm if it goes on."""
+    return physics.peak_force > self.force_limit
+
   def label(self, kind: str) -> str:
     """Returns what an event of the rules is called, see `event`."""
     return ""

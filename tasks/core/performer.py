@@ -99,7 +99,8 @@ NOVICE = {
 _WIDE = 1.0  # action of the jaw: wide open
 _ROLL = 0.8  # of the jaws to grasp, across the gallbladder's slack [rad]
 _ASIDE = 0.2  # of the height that it comes down from: how far aside it may be
-_THERE = 0.004  # jaws that are so near to their place may close [m]
+_THERE, _BEGUN = 0.004, 0.015  # jaws so near to their place may close, or go on closing [m]
+_CLOSED = -0.35  # action of the jaw: as far as it closes at once
 _FIRMER = 0.4  # by how much it is gripped more each time that it was lost [N]
 _SLID = 0.001  # what may move in the jaws unnoticed [m]
 _REFLEX, _FIRMEST = 400.0, 3.0  # force for each metre that slides further [N/m], and at most [N]
@@ -411,18 +412,28 @@ class Performer:
       self.extra[:] = self.share()
       return
     self.roll, deep = _ROLL, min(0.009 + 0.0015 * again, 0.012)
-    below = np.linalg.norm(physics.point(site) - deep * up - self.hand.tip_pos())
-    if again or below > _THERE or self.share() > _WIDE - 0.1:
+
+    def off() -> float:
+      return float(np.linalg.norm(physics.point(site) - deep * up - self.hand.tip_pos()))
+
+    # What somebody else has begun is ended: where a script changed its mind in the middle, who
+    # learns from it would learn the mean of both, and hover with jaws half open.
+    share = self.share()
+    near = _BEGUN if share > _CLOSED + 0.05 else _THERE
+    begun = not again and share < _WIDE - 0.1 and off() < near
+    if begun:
+      self.extra[:] = share
+    else:
       self.extra[:] = _WIDE
       yield from self.above(physics.point(site) - deep * up, 0.012 + deep, up)
       yield from self.wait(0.2)
       yield from self.move(physics.point(site) - deep * up, speed=0.03)
-    else:  # somebody else was about to close
-      self.extra[:] = self.share()
-    while self.extra[0] > -0.35:
+    while self.extra[0] > _CLOSED:
       self.extra[0] -= 3.0 * self.dt
       yield self.step()
     for _ in range(round(2 / self.care / self.dt)):
+      if begun and off() > _THERE and not self.hand.holds():
+        return
       yield self.step()
       if abs(self._squeeze(0.0, 1.0)) < 0.25 and self.hand.holds():
         return
@@ -453,6 +464,6 @@ class Performer:
 
   def open(self) -> Script:
     """Lets go, gently until nothing is held: a pinched fold would jump."""
-    while self.extra[0] < 0.1:
+    while self.extra[0] < 0.1 and not (self.hasty and not self.task.grasped):
       self.extra[0] += self.dt * (1.0 if self.hand.gripper()[2:].any() else 3.0)
       yield self.step()

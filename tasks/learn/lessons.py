@@ -169,7 +169,7 @@ class _Turns:
     """Returns the expert if it is the next to act; `ends` is whether a policy wants to end all."""
     task: Any = self._env.task
     physics: Any = self._env.physics
-    progress, harsh = float(task.progress), physics.peak_force > task.force_limit
+    progress, harsh = float(task.progress), task.harsh(physics)
     self._idle = 0 if progress > self._best else self._idle + 1
     self._best = max(self._best, progress)
     if not self._left or (self._expert is None and self._idle > self._patience):

@@ -70,6 +70,7 @@ ASIDE = 0.002  # how far a strand that is not near is said to be, at most [m]
 SCENE = dataclasses.replace(
   FUNDUS, nodes=250, bonds=BED, second="hook", second_port=(-0.05, -0.01, 0.12)
 )
+_BURNING = 0.2  # share of that time after which somebody should step in
 # Of the expert: how far it pulls at most [m], how much further than it has to, the share of the
 # largest traction it keeps under, how far above a bond the hook aims and begins [m], at what share
 # of the reach it stops, and at what share where others learn of it, who are less exact.
@@ -260,6 +261,11 @@ class Bimanual(Dissect):
     """Returns for how long the current was on, too."""
     own = {"current": self.powered, "idle_current": self.wasted}
     return dict(super().recorded(physics)) | own
+
+  def harsh(self, physics: Physics) -> bool:
+    """Returns whether a force is over its limit, or the hook burns what it touches."""
+    pressed = other_force(physics) > HOOK_LIMIT
+    return super().harsh(physics) or pressed or self.time > _BURNING * BURN
 
   def label(self, kind: str) -> str:
     """Returns what damage is."""

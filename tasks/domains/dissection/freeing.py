@@ -125,6 +125,10 @@ class Freeing(Task):
       free = physics.organ.bonds.free[:, None]
       physics.model.site_rgba[self._films] = np.where(free, RAW, FILM)
 
+  def harsh(self, physics: Physics) -> bool:
+    """Returns whether a force is over its limit, or the pull."""
+    return super().harsh(physics) or self.traction > self.limit
+
   def label(self, kind: str) -> str:
     """Returns what damage is."""
     if kind != "damage":

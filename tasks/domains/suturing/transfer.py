@@ -96,6 +96,7 @@ _BACK, _RISE = 0.014, 0.016  # out of a ring, and off the needle [m]
 # Of a teacher: width of the cone over a goal, at its tip [m] and by height [-], how far a frame may
 # be turned there [rad], height that jaws close from, and how far off a hand has let go [m].
 _NARROW, _CONE, _TURNED, _CLOSES, _CLEAR = 0.0015, 0.2, 0.2, 0.002, 0.02
+_FREE = 0.002  # how high a needle is before a ring that may be put right there [m]
 
 
 @exercise("needle/transfer_easy", 25, "easy", "bimanual")
@@ -360,7 +361,7 @@ class Transfer(Needlework):
           out = pos - sign * left * self.ways[ring - 1]
           yield from carry(p, lambda t: (out, turned))
       way = sign * self.ways[ring]
-      clear = place - _BACK * way
+      clear = place - min(_height(p, needle(p.physics), (place, mat), -way), _BACK) * way
       yield from _come(
         carry(p, lambda t: (clear, mat)), lambda: _over(p, needle(p.physics), (place, mat), -way)
       )
@@ -450,6 +451,18 @@ def _over(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> bool:
   aside = float(np.linalg.norm(off - high * up))
   far = aside > _NARROW + _CONE * max(high, 0.0) or apart(pose[1], goal[1]) > _TURNED
   return p.hasty and -2 * _NARROW < high < 2 * _RISE and not far
+
+
+def _height(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> float:
+  """Returns how high over a goal a pose is put right [m].
+
+  A teacher goes back no further than it must. Who learns from one that goes all of the way back, or
+  none of it, goes to and fro before the goal.
+  """
+  off = pose[0] - goal[0]
+  aside = float(np.linalg.norm(off - (off @ up) * up))
+  turned = apart(pose[1], goal[1]) / _TURNED
+  return max(aside - _NARROW, 0.0) + _FREE * max(turned, 1.0) if p.hasty else math.inf
 
 
 def _lingers(p: Performer) -> bool:
