@@ -351,7 +351,7 @@ class Transfer(Needlework):
   def _drive(self, p: Performer) -> Script:
     """Brings the end that goes first to the ring, and turns it through as far as to be taken."""
     ring, sign = now(self), -1.0 if back(self) else 1.0
-    if not self.through:
+    if not self.through and not _begun(p, self):
       place, mat = entrance(self, ring)
       if ring:  # out of the ring before
         pos, turned = needle(p.physics)
@@ -365,7 +365,7 @@ class Transfer(Needlework):
       yield from _come(
         carry(p, lambda t: (clear, mat)), lambda: _over(p, needle(p.physics), (place, mat), -way)
       )
-      yield from carry(p, lambda t: (place, mat))
+      yield from _come(carry(p, lambda t: (place, mat)), lambda: _begun(p, self))
     start, end = turn_of(self, p.physics), -QUARTER - sign * _HANDS
     yield from carry(p, lambda t: posed(self, ring, start + t * (end - start)), end - start)
 
@@ -451,6 +451,15 @@ def _over(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> bool:
   aside = float(np.linalg.norm(off - high * up))
   far = aside > _NARROW + _CONE * max(high, 0.0) or apart(pose[1], goal[1]) > _TURNED
   return p.hasty and -2 * _NARROW < high < 2 * _RISE and not far
+
+
+def _begun(p: Performer, task: Transfer) -> bool:
+  """Returns whether a teacher's needle may turn into the ring from where it is."""
+  (pos, mat), turn, sign = needle(p.physics), turn_of(task, p.physics), -1.0 if back(task) else 1.0
+  place, turned = posed(task, now(task), turn)
+  way = sign * (turn + QUARTER) + QUARTER + _ENTERS
+  there = np.linalg.norm(pos - place) < _NARROW and apart(mat, turned) < _TURNED
+  return p.hasty and there and -_TURNED < way < 2 * _ENTERS
 
 
 def _height(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> float:
