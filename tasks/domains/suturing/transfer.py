@@ -425,6 +425,8 @@ def park(task: Transfer, port: Any, middle: np.ndarray) -> Pose:
 
 def _let_go(task: Transfer, p: Performer) -> Script:
   """Opens the jaws and takes the hand aside."""
+  if p.hasty:  # from where another has come to
+    p.extra[:] = p.share()
   yield from jaws(p, WIDE)
 
   def gone() -> bool:
