@@ -464,6 +464,8 @@ class Performer:
 
   def open(self) -> Script:
     """Lets go, gently until nothing is held: a pinched fold would jump."""
-    while self.extra[0] < 0.1 and not (self.hasty and not self.task.grasped):
+    if self.hasty and not (self.task.grasped or self.hand.holds()):
+      return  # it was lost, and is grasped again at once
+    while self.extra[0] < 0.1:
       self.extra[0] += self.dt * (1.0 if self.hand.gripper()[2:].any() else 3.0)
       yield self.step()

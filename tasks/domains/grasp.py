@@ -363,7 +363,8 @@ class Grasp(Hold):
     for again in itertools.count():
       if self.outcome is not None:
         return
-      yield from p.close(self.site, again)
+      if not self.letting:  # nor has somebody else begun to let go
+        yield from p.close(self.site, again)
       up = physics.trocar().mat[:, 2]
       speed, contact = 0.012 * p.style.speed, 0.0
       yield from p.wait(p.style.delay)

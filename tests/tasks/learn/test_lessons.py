@@ -1,16 +1,19 @@
 """Lessons: an expert goes on where another has come to."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from palpate import tasks
 from palpate.tasks.core import performer
+from palpate.tasks.domains.dissection.bimanual import BURN
 from palpate.tasks.domains.probing import probe
 from palpate.tasks.learn import lessons, policy
 
 
-def played(env, act, until, most=400):
-  """Plays an episode until something is so; returns the time step."""
-  timestep = env.reset()
+def played(env, act, until, most=400, first=None):
+  """Plays an episode, or goes on from a time step, until something is so; returns the time step."""
+  timestep = first or env.reset()
   for _ in range(most):
     if until(env.task):
       return timestep
@@ -37,6 +40,36 @@ def test_an_expert_goes_on_with_what_has_begun(domain, begun, lost):
       break
     assert not lost(env.task)
   assert env.task.progress >= before
+
+
+def test_teachers_close_jaws_that_somebody_has_begun_to_close():
+  env = tasks.load("grasp", "easy", task_kwargs={"random": 3, "surroundings": "none"})
+  timestep = played(env, lessons.Teacher(env), lambda task: np.linalg.norm(task.target) < 0.01)
+  down = np.array([0.0, 0.0, 0.0, 0.2, 0.3])  # to the site, too high for the jaws
+  near = lambda task: np.linalg.norm(task.target) < 0.005  # noqa: E731
+  timestep = played(env, lambda _: down, near, first=timestep)
+  told = []
+  for _ in range(9):
+    told.append(lessons.Teacher(env)(timestep)[4])
+    timestep = env.step(np.array([0.0, 0.0, 0.0, 0.0, told[-1]]))
+  np.testing.assert_allclose(np.diff(told), -0.06, atol=0.001)
+  assert lessons.Teacher(env)(env.step(np.zeros(5) - 0.35))[4] == 1.0  # nothing is held: again
+
+
+@pytest.mark.parametrize(("domain", "level"), [("grasp", "easy"), ("needle", "transfer_easy")])
+def test_teachers_that_take_turns_are_as_quick_as_one(domain, level):
+  env = tasks.load(domain, level, task_kwargs={"surroundings": "none"})
+
+  def steps(turn):
+    env.task.random, act, count = np.random.RandomState(3), lessons.Teacher(env), 0
+    timestep = env.reset()
+    while not timestep.last():
+      act = lessons.Teacher(env) if count and count % turn == 0 else act
+      timestep, count = env.step(act(timestep)), count + 1
+    assert env.task.outcome == "success"
+    return count
+
+  assert steps(5) < 1.3 * steps(1000)
 
 
 def test_an_expert_presses_on_the_site_where_another_came_down_beside_it():
@@ -68,6 +101,31 @@ def test_a_teacher_of_the_transfer_goes_on_where_another_has_come_to():
     assert (np.diff(far) < 0).all()
     while not env.task.through or np.linalg.norm(env.task.target) > 0.007:
       timestep = env.step(act(timestep))
+
+
+def test_a_teacher_goes_back_no_further_from_a_ring_than_it_must():
+  kwargs = {"random": 3, "surroundings": "none"}
+  env = tasks.load("needle", "transfer_easy", task_kwargs=kwargs)
+  task: Any = env.task
+
+  def ahead():
+    return float(task.lead @ task.way)
+
+  def aside():
+    return float(np.linalg.norm(task.lead - ahead() * task.way))
+
+  timestep = played(env, lessons.Teacher(env), lambda _: ahead() > -0.006 and aside() < 0.001)
+  push = np.zeros(len(task.components))
+  push[[0, 6]] = -0.2, -1.0
+  timestep = played(env, lambda _: push, lambda _: aside() > 0.0035, first=timestep)
+  before, act, way = ahead(), lessons.Teacher(env), []
+
+  def through(task):
+    way.append(ahead())
+    return task.through
+
+  played(env, act, through, first=timestep)
+  assert min(way) > before - 0.004
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -130,6 +188,15 @@ def test_who_presses_too_hard_is_helped_while_there_is_a_way_back():
   peak, first = lesson.seen[:, 0], int(lesson.taught.argmax())
   assert lesson.outcome == "success" and peak.max() < 2 * env.task.force_limit
   assert peak[first] > env.task.force_limit > peak[first - 1]
+
+
+def test_who_burns_the_organ_is_helped():
+  env = tasks.load("bimanual", "easy", task_kwargs={"random": 3, "surroundings": "none"})
+  env.reset()
+  task: Any = env.task
+  assert not task.harsh(env.physics)
+  task.time = 0.3 * BURN
+  assert task.harsh(env.physics)
 
 
 def test_a_policy_does_not_end_the_lesson_of_a_search():
