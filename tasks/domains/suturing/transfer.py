@@ -460,7 +460,7 @@ def _begun(p: Performer, task: Transfer) -> bool:
   (pos, mat), turn, sign = needle(p.physics), turn_of(task, p.physics), -1.0 if back(task) else 1.0
   place, turned = posed(task, now(task), turn)
   way = sign * (turn + QUARTER) + QUARTER + _ENTERS
-  there = np.linalg.norm(pos - place) < _NARROW and apart(mat, turned) < _TURNED
+  there = float(np.linalg.norm(pos - place)) < _NARROW and apart(mat, turned) < _TURNED
   return p.hasty and there and -_TURNED < way < 2 * _ENTERS
 
 
