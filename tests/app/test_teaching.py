@@ -32,9 +32,9 @@ def school(folder, monkeypatch):
   return teaching.School(folder, "touch/easy", {}, seed=0, updates=10)
 
 
-def teach(found, count, **words):
+def teach(found, count, stop=lambda: False, **words):
   networks = types.SimpleNamespace(learn=learn)
-  return found.teach(networks, workers.HERE, count, 0.99, lambda: False, **words)
+  return found.teach(networks, workers.HERE, count, 0.99, stop, **words)
 
 
 def test_lessons_end_when_the_time_is_over_and_are_learned_from(tmp_path, monkeypatch, capsys):
@@ -49,6 +49,24 @@ def test_lessons_end_when_the_time_is_over_and_are_learned_from(tmp_path, monkey
   assert f"round 2: {count} of {count} were a success" in said and "error 0.500" in said
   with pytest.raises(CommandError, match="no lesson was given: the time was over"):
     teach(school(tmp_path, monkeypatch), 1000, until=0.0)
+
+
+def test_no_round_begins_that_would_be_cut_short(tmp_path, monkeypatch):
+  found = school(tmp_path, monkeypatch)
+  assert not found.ends(0.1)
+  assert teach(found, 2)
+  assert found.ends(1.2 * found.seconds) and not found.ends(1.8 * found.seconds)
+
+
+def test_lessons_are_kept_where_learning_from_them_is_interrupted(tmp_path, monkeypatch):
+  found, start = school(tmp_path, monkeypatch), []
+
+  def stop():  # after two lessons, while the networks learn
+    start.append(time.monotonic()) if len(found.lessons) == 2 else None
+    return bool(start) and time.monotonic() > start[0] + 0.2
+
+  assert not teach(found, 2, stop)
+  assert found.rounds == 1 and len(found.lessons) == 2
 
 
 def test_without_a_terminal_lessons_tell_how_far_they_are(tmp_path, monkeypatch, capsys):

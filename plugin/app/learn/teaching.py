@@ -28,6 +28,7 @@ _FIRST = 10_000_000  # seed of the first lesson
 _NOISE = 0.2  # SD of what shakes the expert in every other lesson, at most [-]
 _TURN = 60  # control steps of the policy's turns in every other lesson, at most
 _ENOUGH = 0.95  # share of the rest that it brings to a good end alone
+_LEAST = 0.5  # of the time of a round, for the next to begin: one that is cut short does harm
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,14 +91,13 @@ class School:
     self.path, self.task, self.seed, self.updates = folder / LESSONS, task, seed, updates
     self.task_kwargs = json.dumps({"surroundings": "unseen", **task_kwargs})  # it draws nothing
     self.lessons: list[Lesson] = []
-    self.rounds, self.seconds, self.alone = 0, 0.0, 0.0
+    self.rounds, self.seconds, self.alone, self._last = 0, 0.0, 0.0, 0.0
     if self.path.exists():
       self._load()
 
-  @property
-  def enough(self) -> bool:
-    """Whether the policy needs no more lessons."""
-    return self.alone >= _ENOUGH
+  def ends(self, until: float) -> bool:
+    """Returns whether no round is to follow: the policy needs none, or has no time [s] for it."""
+    return self.alone >= _ENOUGH or until - self.seconds <= _LEAST * self._last
 
   @property
   def taught(self) -> bool:
@@ -115,12 +115,14 @@ class School:
   ) -> bool:
     """Gives a round of lessons, which the networks learn from; returns whether it is whole.
 
+    Lessons that were given are kept, whether the networks have learned from them to the end or not.
+
     Args:
       networks: that learn; the policy beside the lessons is theirs
       crew: who gives lessons
       count: of lessons
       gamma: discount [-]
-      stop: once it says so, the round is given up
+      stop: once it says so, the round is given up, or no more is learned of it
       until: seconds of all rounds that learning ends after; no lesson begins after half of those
         that are left
     """
@@ -152,7 +154,8 @@ class School:
       error = networks.learn(self.lessons, self.updates, spent)
     progress.clear()
     self.rounds += 1
-    self.seconds += time.perf_counter() - start
+    self._last = time.perf_counter() - start
+    self.seconds += self._last
     wins = sum(lesson.outcome == "success" for lesson in whole)
     # Lessons in which a policy was let to do all.
     pairs = zip(given, jobs, strict=False)

@@ -149,7 +149,8 @@ class Training:
     from palpate.tasks.learn import policy
 
     own = self.folder / policy.FILE
-    path = own if begun or self.school.rounds else self.args.start
+    taught = self.school.rounds and own.exists()  # unless the first round was interrupted
+    path = own if begun or taught else self.args.start
     if not path or (begun and not own.exists()):
       return
     try:
@@ -189,10 +190,13 @@ class Training:
     if self.teacher or (self.folder / learning.CHECKPOINT).exists():  # it practises already
       return True
     count, gamma, until = self.args.lessons, self.settings.gamma, 60 * self.args.minutes
-    while count and school.rounds < ROUNDS and not school.enough and school.seconds < until:
-      if not school.teach(networks, crew, count, gamma, interrupt, until):
+    while count and school.rounds < ROUNDS and not school.ends(until):
+      before = school.rounds
+      whole = school.teach(networks, crew, count, gamma, interrupt, until)
+      if school.rounds > before:
+        school.save()
+      if not whole:
         return False
-      school.save()
       self._write_taught()
     return not interrupt.seen
 
