@@ -485,7 +485,8 @@ class Running(Stitching):
       yield from self._turn(p, end)
     while inside():  # not of a hole that is lost
       yield from p.line(p.tip + np.array([0.001, 0.0, 0.002]), 0.02)
-    yield from self._pull(p, lambda: self.tight > _TAUT)
+    # Who has closed the cut pulls no harder, see below.
+    yield from self._pull(p, lambda: self.tight > _TAUT or self._shut(p.physics))
 
   def _hand(self, p: Performer) -> Script:
     """Brings the needle over the next stitch, to where the right hand can take it."""
@@ -506,6 +507,10 @@ class Running(Stitching):
       speed = _DRAWN * p.style.speed if self._slack(p.physics) > _LITTLE else careful
       p.tip = p.tip + speed * p.dt * _WAY
       yield p.step()
+
+  def _shut(self, physics: Any) -> bool:
+    """Returns whether the cut is closed more than is asked for, by a thread with little slack."""
+    return bool(self.gap < _SHUT * self.close and self._slack(physics) < _LITTLE)
 
   def _slack(self, physics: Any) -> float:
     """Returns how much longer the thread is from its first hole to the needle than the way [m]."""
