@@ -4,8 +4,7 @@ python docs/close_wound.py
 
 Stay sutures pull at both sides of the cut. A hand drives a needle through both lips three times and
 pulls its thread, which ends in a bead, until the cut is closed. A clip on the thread, over the last
-hole, ends the suture, and the hand lets go. The lips do not touch each other: they may overlap
-where the thread pulls more than the wall does.
+hole, ends the suture, and the hand lets go.
 """
 
 import pathlib

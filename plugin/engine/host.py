@@ -142,11 +142,21 @@ class Host(host.Host):
       self.springs = wp.zeros_like(there, device="cpu", pinned=True) if cuda else there
       self._fill_input()
 
+  def need_pairs(self):
+    """See `Host`."""
+    cuda = self.body.device.is_cuda
+    for name, there in bodies.pairs(self.body).items():
+      self.arrays[name] = wp.clone(there, device="cpu", pinned=True) if cuda else there
+
   def send_springs(self):
     """Brings the springs to the device of the solve."""
-    there = self.body.state.hold
-    if self.springs is not None and there.device.is_cuda:
-      wp.copy(there, self.springs)
+    state = self.body.state
+    if not self.body.device.is_cuda:
+      return
+    if self.springs is not None:
+      wp.copy(state.hold, self.springs)
+    for name in bodies.PAIRS if "paired" in self.arrays else ():
+      wp.copy(getattr(state, name), self.arrays[name])
 
   def flags(self) -> wp.array:
     """See `Host`."""

@@ -172,6 +172,10 @@ class Host(abc.ABC):
     """Makes `springs`."""
 
   @abc.abstractmethod
+  def need_pairs(self):
+    """Adds to `arrays` those of springs between nodes, see `palpate.tissue.body.pairs`."""
+
+  @abc.abstractmethod
   def flags(self) -> wp.array:
     """Returns what its coupling reports, see `layout.FLAG`."""
 

@@ -3,7 +3,8 @@
 # pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
-from palpate.tissue.types import doubles, floats, ints, scalar, struct, vector
+from palpate.tissue import body as bodies
+from palpate.tissue.types import blank, doubles, floats, ints, scalar, struct, vector
 
 from ..engine.layout import FLAG
 from .host import Bodies, Host, edited, kernels
@@ -22,6 +23,9 @@ class Relaxing:
   flags: ints(len(FLAG))  # see FLAG
   quiet: doubles("nworld")  # how long it has been at rest [s]
   hold: floats("nworld", "nholdslice", 6, 8)
+  paired: ints("nworld")  # see `State`
+  pair_node: ints("nworld", "npairslice", 8)
+  pair_hold: floats("nworld", "npairslice", 6, 8)
   mass: scalar
   force_ext: vector
   dvel: vector
@@ -59,7 +63,8 @@ class Relaxation(Force):
     if not self:
       return
     host, solve = self.host, self.host.input
-    values = dict(
+    none = {name: blank(Relaxing, name, host.device) for name in bodies.PAIRS}
+    values = (none | host.arrays) | dict(
       nrelax=self.count,
       node=solve.node.numpy()[self._node],
       memory=host.rows("relaxation", 6),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from .attachments import Attachments
 from .cohesive_bonds import Bonds
 from .cutters import Cutters
+from .lips import Lips
 from .needles import Needles
 from .passive import Force
 from .relaxation import Relaxation
@@ -18,6 +19,7 @@ FORCES: dict[str, type[Force]] = {
   "supports": Supports,
   "relaxation": Relaxation,
   "needles": Needles,
+  "lips": Lips,
   "tears": Tears,
   "cutters": Cutters,
 }

@@ -10,7 +10,7 @@ import warp as wp
 
 from .device import WORDS, Plan
 from .geometry.mesh import Mesh
-from .order import LANES
+from .order import LANES, offset
 from .types import (
   DIMS,
   NUMBERS,
@@ -25,6 +25,8 @@ from .types import (
   allocate,
   fill,
 )
+
+PAIRS = ("paired", "pair_node", "pair_hold")  # of `State`, see `pairs`
 
 
 @dataclasses.dataclass
@@ -151,6 +153,7 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
     "nareaslice": out["nslice"] if bends or values["closed"] else 0,
     "nquadslice": out["nslice"],
     "nholdslice": 0,
+    "npairslice": 0,
     "ncycleslice": 0,
     "ncyclebendslice": 0,
     "nword": WORDS,
@@ -257,6 +260,20 @@ def hold(body: Body) -> wp.array:
     if body.levels is not None:
       body.levels.cycle.fine = body.fields
   return body.state.hold
+
+
+def pairs(body: Body) -> dict[str, wp.array]:
+  """Returns `state.paired` and so on, for springs between nodes, which a body gets when asked."""
+  if not body.state.pair_hold.size:
+    shape = (body.nworld, body.shape.nslice, 6, LANES)
+    own = offset(np.arange(body.shape.nnode)).reshape(1, -1, LANES)  # which is always there
+    body.fields.state.pair_node = wp.array(
+      np.broadcast_to(own, (body.nworld, *own.shape[1:])), dtype=int, device=body.device
+    )
+    body.fields.state.pair_hold = wp.zeros(shape, dtype=float, device=body.device)
+    if body.levels is not None:
+      body.levels.cycle.fine = body.fields
+  return {name: getattr(body.state, name) for name in PAIRS}
 
 
 def arrays(body: Body) -> dict[str, Any]:

@@ -242,6 +242,9 @@ class State:
   mass: scalar  # mass [kg]
   force_ext: vector  # external and lagged contact force [N]
   hold: floats("nworld", "nholdslice", 6, 8)  # what springs in `force_ext` weigh on dv [kg]
+  paired: ints("nworld")  # whether springs there are between two nodes each
+  pair_node: ints("nworld", "npairslice", 8)  # offset of the other one
+  pair_hold: floats("nworld", "npairslice", 6, 8)  # what such a spring weighs on their dv [kg]
   dvel: vector  # change of velocity in this step [m/s]
   dvel_warm: vector  # what those of the last steps lead to, where PCG starts [m/s]
   expected: floats("nworld")  # b^T Mhat^-1 b, for the impulses b that a response is to [J]

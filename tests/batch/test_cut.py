@@ -340,7 +340,7 @@ def test_a_cut_solid_goes_on_as_the_plugin_does(device, windows):
     force.append((alone.contact_force.sum(axis=0)[2], *total))
   force = np.array(force)
   peak = np.abs(force[:, 0]).max()
-  off = 0.02 if "cuda" in device else 0.01
+  off = 0.03 if "cuda" in device else 0.01  # a node may touch a step sooner or later
   assert peak > 0.1 and np.sqrt(np.mean((force[:, 0] - force[:, 1]) ** 2)) < off * peak
   np.testing.assert_array_equal(force[:, 1], force[:, 2])
   assert np.abs(force[:, 0] - force[:, 3]).max() > 0.3 * peak  # that is whole

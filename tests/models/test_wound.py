@@ -30,6 +30,7 @@ def test_stitches_close_a_cut_of_a_gallbladder_and_hold_twice_the_pull(script):
   assert sewn.gaps.max() > 1.5e-3
   sewn.take_needle()
   for stitch in range(script.STITCHES):
+    assert sewn.gaps.min() > -5e-5
     before = len(sewn.organ.pinholes)
     sewn.drive(stitch)
     sides = [(hole.rest - sewn.middle) @ sewn.frame[:, 1] for hole in sewn.organ.pinholes[before:]]
@@ -47,6 +48,9 @@ def test_stitches_close_a_cut_of_a_gallbladder_and_hold_twice_the_pull(script):
     assert each.organ.error is None
   assert bare.gaps.max() > 3.5e-3
   assert sewn.gaps.max() < 1e-3
+  bare.stay(-script.OPEN)  # pushed together, lips that did not touch overlapped by 3 mm
+  bare.wait(400)
+  assert -3e-4 < bare.gaps.min() < 0.0
   assert not np.any([hole.torn for hole in sewn.organ.pinholes])
   # The last stitch pulls at the clip alone, and that at the wall.
   last = int(-sewn.organ.pinholes[-1].along / script.EDGE)

@@ -62,6 +62,10 @@ class Host(host.Host):
     """See `Host`."""
     self.springs = bodies.hold(self._organ.body)
 
+  def need_pairs(self):
+    """See `Host`."""
+    self.arrays |= bodies.pairs(self._organ.body)
+
   def flags(self) -> wp.array:
     """See `Host`."""
     return self._flags[bool(self._organ.patch.stiff and self._organ.responds)]

@@ -252,6 +252,13 @@ PALPATE size_t mesh_of(const Fields& f, int world) {
   return MESHES && f.shape.mesh.data ? (size_t)f.shape.stride * f.shape.mesh.data[world] : 0;
 }
 
+// What springs between nodes weigh in a world, or null where there are none.
+template <class Fields>
+PALPATE const float* pair_hold(const Fields& f, int world) {
+  return f.state.pair_hold.data && f.state.paired.data[world]
+    ? f.state.pair_hold.data + 48 * (size_t)world * f.shape.nslice : nullptr;
+}
+
 #if ON_CUDA
 // Lane of a thread. That it is below eight is hidden from the compiler, which otherwise takes rows
 // for bits of one number and computes the address of each anew.

@@ -9,6 +9,20 @@ PALPATE D3 unit(D3 a) {
   return (1.0 / (size > 1e-300 ? size : 1e-300)) * a;
 }
 
+// A vector that `s` has along its axes x, y and z.
+template <class Axes>
+PALPATE D3 in_axes(const Axes& s, D3 a) { return a.x * s.x + a.y * s.y + a.z * s.z; }
+
+// Makes the axes those of a triangle: its first edge, its normal, and what is across to both.
+template <class Axes>
+PALPATE void set_axes(Axes& s, D3 edge, D3 other) {
+  const D3 zero = {0.0, 0.0, 0.0}, area = cross(edge, other);
+  const double length = norm(edge), size = norm(area);
+  s.x = length > 0.0 ? (1.0 / length) * edge : zero;
+  s.z = size > 0.0 ? (1.0 / size) * area : zero;
+  s.y = cross(s.z, s.x);
+}
+
 // 1 of an equilateral triangle.
 PALPATE double shape_of(const D3* x) {
   const D3 a = x[1] - x[0], b = x[2] - x[1], c = x[0] - x[2];

@@ -34,17 +34,6 @@ PALPATE Fields of_world(Fields f, int world) {
   return f;
 }
 
-PALPATE D3 in_axes(const Seat& s, D3 a) { return a.x * s.x + a.y * s.y + a.z * s.z; }
-
-// Of a triangle: its first edge, its normal, and what is across to both.
-PALPATE void set_axes(Seat& s, D3 edge, D3 other) {
-  const D3 zero = {0.0, 0.0, 0.0}, area = cross(edge, other);
-  const double length = norm(edge), size = norm(area);
-  s.x = length > 0.0 ? (1.0 / length) * edge : zero;
-  s.z = size > 0.0 ? (1.0 / size) * area : zero;
-  s.y = cross(s.z, s.x);
-}
-
 template <class Fields>
 PALPATE Seat seat_on_body(const Fields& f, const Twist& moving) {
   const auto* R = f.mj.xmat.data + 9 * f.body;

@@ -16,6 +16,7 @@ namespace palpate {
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
   move_each(world, f.memory, f.quiet, f.hold, f.mass, f.force_ext, f.dvel, f.sol, f.rhs, f.status);
+  if (f.paired.data) move_each(world, f.paired, f.pair_node, f.pair_hold);
   return f;
 }
 
@@ -46,12 +47,17 @@ PALPATE void end_relaxation(const Fields& all, Thread t, int) {
   const double per_h = 1.0 / f.mj.timestep.data[0];
   each_item(t, f.nrelax, [&](int i) {
     const int node = f.node.data[i], at = offset_of(node);
-    D3 dv = load_lane(f.dvel.data + at), besides = load_lane(f.force_ext.data + at);
-    if (f.flags.data[FLAG_ANSWERED]) {
-      dv += load_lane(f.sol.data + at);
-      besides += per_h * load_lane(f.rhs.data + at);
-    }
+    const bool answered = f.flags.data[FLAG_ANSWERED];
+    const auto change = [&](int at) {
+      const D3 dv = load_lane(f.dvel.data + at);
+      return answered ? dv + load_lane(f.sol.data + at) : dv;
+    };
+    const D3 dv = change(at);
+    D3 besides = load_lane(f.force_ext.data + at);
+    if (answered) besides += per_h * load_lane(f.rhs.data + at);
     if (f.held) besides = besides - per_h * (load_hold(hold_at(f.hold.data, node)) * dv);
+    if (f.paired.data && f.paired.data[0])
+      besides = besides - per_h * (load_hold(hold_at(f.pair_hold.data, node)) * (dv - change(f.pair_node.data[node])));
     const D3 force = (per_h * f.mass.data[node]) * dv - besides, left = faded(f, i);
     double* memory = f.memory.data + 6 * i;
     store(memory, force);

@@ -18,6 +18,8 @@ struct Matrix {
   const int* bend_node;
   const float* bend_gain;
   const float* hold;  // of nodes that springs hold, or null
+  const float* pair;  // of springs between two nodes, and which the other one is; or null
+  const int* pair_node;
   const float* capsule;  // blocks of the skin of a solid, and where they are; or null
   const int *capsule_adr, *capsule_node;
   float bend;  // (h^2 + h damping) times the scale of the plate, for the bending matrix
@@ -41,6 +43,7 @@ PALPATE Matrix matrix(const Fields& f, int world) {
     f.lump.bend_gain.data ? f.lump.bend_gain.data + 8 * nbend * world
                           : f.tissue.bend_gain.data + mesh,
     f.state.hold.data ? f.state.hold.data + 48 * base : nullptr,
+    pair_hold(f, world), f.state.pair_node.data + 8 * base,
     f.shape.ncapsule ? f.system.capsule_block.data + 72 * (size_t)world * f.shape.ncapsule : nullptr,
     f.shape.capsule_adr.data, f.shape.capsule_node.data,
     f.state.step.data[4 * world + 1] * numbers(f, world)[PLATE], BENDING && f.shape.nhingeslice > 0
@@ -85,6 +88,13 @@ PALPATE V3 product(const Any& a, const Vector& z, V3 own, int s, Lane lane) {
   }
   if constexpr (Any::SOLID) out = a.unit * z.joined(out) + ld(a.diag, s, lane) * own;
   if (a.hold) out = out + ld6(a.hold + 48 * s, lane) * own;
+  if (a.pair) {
+    V3 between = zero;
+    z.each_near(
+      a.pair_node + 8 * s, 1, lane, [&](int) { return ld6(a.pair + 48 * s, lane); },
+      [&](const S3& m, V3 near) { between += m * (own - near); });
+    out = out + z.joined(between);
+  }
   if (Any::SOLID && a.capsule) {
     const int row = a.capsule_adr[s], width = a.capsule_adr[s + 1] - row;
     const float* block = a.capsule + 72 * (size_t)row;

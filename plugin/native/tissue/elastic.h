@@ -246,13 +246,24 @@ PALPATE V3 bending(const Fan& fan, const float* normal, const float* corner, V3 
   return b;
 }
 
-// What springs that hold nodes add to the diagonal block; in `b` they have it for what later
-// iterations have changed already.
+// What springs that hold nodes, and those between two, add to the diagonal block; in `b` they have it for what
+// later iterations have changed already.
 template <class Fields>
-PALPATE S3 hold(const Fields& f, int stage, size_t at, V3& b, Lane lane) {
-  const S3 weight = ld6(f.state.hold.data + 48 * at, lane);
-  if (stage == LATER) b -= weight * ld3(f.state.dvel.data + 24 * at, lane);
-  return weight;
+PALPATE S3 hold(const Fields& f, int world, int stage, int s, V3& b, Lane lane) {
+  const V zero = splat(0.0f);
+  S3 out = {zero, zero, zero, zero, zero, zero};
+  const size_t base = (size_t)world * f.shape.nslice, at = base + s;
+  const float* dvel = f.state.dvel.data + 24 * base;
+  if (f.state.hold.data) {
+    out = ld6(f.state.hold.data + 48 * at, lane);
+    if (stage == LATER) b -= out * ld3(dvel + 24 * s, lane);
+  }
+  if (const float* pair = pair_hold(f, world)) {
+    const S3 weight = ld6(pair + 48 * s, lane);
+    if (stage == LATER) b -= weight * (ld3(dvel + 24 * s, lane) - gather3(dvel, f.state.pair_node.data + 8 * at, lane));
+    out = out + weight;
+  }
+  return out;
 }
 
 // Writes what is on the diagonal of a slice, and the inverse of `self`, the block there: zero where a
@@ -313,7 +324,7 @@ struct Assembly {
       + gv * (sum.rate - kf * m.v);
     if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * own, lane);
     S3 self = splat(g) * sum.stiffness + diag;
-    if (f.state.hold.data) self = self + hold(f, stage, own, b, lane);
+    if (f.state.hold.data || pair_hold(f, world)) self = self + hold(f, world, stage, s, b, lane);
     if (areas) st3(at.areavec + 24 * s, sum.area, lane);
     if (bends) self = self + bent(fan, sum, s, b, lane);
     st3(at.rhs + 24 * s, b, lane);

@@ -284,7 +284,7 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
       b += gather_shared(impulse, around + 8 * k, lane);
     const V zero = splat(0.0f);
     S3 held = {zero, zero, zero, zero, zero, zero};
-    if (f.state.hold.data) held = hold(f, stage, at, b, lane);
+    if (f.state.hold.data || pair_hold(f, t.world)) held = hold(f, t.world, stage, s, b, lane);
     if (f.shape.ncapsule) {  // see `capsule_row`
       b += ld3(f.system.rhs.data + 24 * at, lane);
       held = held + ld6(f.system.inverse.data + 48 * at, lane);
