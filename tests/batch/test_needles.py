@@ -89,15 +89,16 @@ def test_a_needle_goes_through_a_wall_of_two_layers_as_under_the_plugin(device):
 @SLOW
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_thread_through_both_layers_of_a_wall_is_held_as_under_the_plugin(device):
-  """Both hold it, and neither touches it in between."""
+  """Both hold it by a hole; the thread meets neither, as batches find fewer of such contacts."""
   spec = one.wall(nodes=16, pos=(0.0172, 0, 0), contact=APART)
+  spec.flex("suture").conaffinity = 0
   model, data, organ = one.load(spec)
   lower = palpate.Organ(model, data, "lower")
   one.drive(model, data, organ, [4.6])
   mujoco.mj_step(model, data, 300)
   worlds = palpate.batch.make(spec, 2, device)
   worlds.set_state(1, data)
-  worlds.ctrl = np.tile(data.ctrl, (2, 1))
+  worlds.ctrl = np.stack([0 * data.ctrl, data.ctrl])
   at = worlds.bare.body("suture_15").id
   for k in range(30):
     data.body("suture_15").xfrc_applied[1] = 5e-3 * k
@@ -110,7 +111,7 @@ def test_a_thread_through_both_layers_of_a_wall_is_held_as_under_the_plugin(devi
       (hole,) = each.pinholes
       assert hole.thread
       found = worlds.organ(each.name).needles
-      np.testing.assert_allclose(found.hole_force.numpy()[1, 0, 0], hole.force, atol=0.02)
+      np.testing.assert_allclose(found.hole_force.numpy()[1, 0, 0], hole.force, atol=2e-3)
       np.testing.assert_allclose(found.hole_along.numpy()[1, 0, 0], hole.along, atol=5e-5)
   assert worlds.organ("lower").needles.count.numpy().tolist() == [[0], [1]]
 
