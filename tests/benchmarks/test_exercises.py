@@ -14,11 +14,11 @@ from palpate.tasks.people import score
 
 HERE = pathlib.Path(__file__).parent
 # Share of experts that are not proficient where it is above 5 %: rare peaks of pressure and strain,
-# and gaps of a running suture whose references are older. And of those that fail: a hole that
-# is lost as strands are let go.
-SHORT = {"bimanual/hard": 0.12, "retract/hard": 0.06, "suture/running_easy": 0.06,
-         "suture/running_hard": 0.1, "suture/extracorporeal_hard": 0.13}  # fmt: skip
-FAIL = {"suture/extracorporeal_hard": 0.07}
+# a cut that is gone over again, force on what is around a probe, and gaps of a running suture
+# whose references are older.
+SHORT = {"bimanual/hard": 0.08, "cut/standard": 0.1, "cut/hard": 0.14, "navigate/hard": 0.06,
+         "probe/palpate_easy": 0.14, "retract/hard": 0.06, "suture/running_easy": 0.06,
+         "suture/running_hard": 0.08, "suture/extracorporeal_hard": 0.08}  # fmt: skip
 
 
 def command(*words) -> int:
@@ -72,8 +72,7 @@ def test_kept_episodes_rank_as_they_should():
   assert names >= {row["task"] for row in table(HERE / "results" / "exercises_cpu.csv")}
   for name in names:
     expert, people, novice = (groups[name, who] for who in ("expert", "skilled", "novice"))
-    failed = sum(row["outcome"] != score.SUCCESS for row in expert)
-    assert len(expert) >= 12 and failed <= FAIL.get(name, 0.0) * len(expert), name
+    assert len(expert) >= 12 and {row["outcome"] for row in expert} == {score.SUCCESS}, name
     missed = sum(not row["proficient"] for row in expert)
     assert missed <= max(1, SHORT.get(name, 0.05) * len(expert)), name
     assert not people or share(people) >= 0.75, name
