@@ -15,11 +15,10 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.engine import layout
-from palpate.engine.cutting.walls import opened
 from palpate.engine.model import flexes, mjstruct
 from palpate.engine.model.skin import Skin
 from palpate.tissue.geometry import subdivide
-from palpate.tissue.geometry.mesh import Mesh, corners, vertex_normals
+from palpate.tissue.geometry.mesh import Mesh, corners, opened, vertex_normals
 from palpate.tissue.types import fill
 from scipy.sparse import csr_array, eye_array
 

@@ -53,15 +53,14 @@ class Lips(Force):
     super().__init__(host)
     self._lists: Lists | None = None
     config = host.organ.config
-    self._can_be = bool(config.spare) and SCHEMES[config.integrator].solids and not config.resident
-    if self._can_be:
+    if config.spare and SCHEMES[config.integrator].solids and not config.resident:
       self.count = host.organ.mesh.spare
       host.need_pairs()
       found = self._values(host.organ.mesh)
       self._lists = Lists(host, Lipped, [], found, self.count - len(found["vert"]))
 
   def __bool__(self) -> bool:
-    return self._can_be
+    return self._lists is not None
 
   def bind(self):
     """See `Force`."""
@@ -150,7 +149,8 @@ def _edges(mesh: Mesh, thickness: float) -> tuple[np.ndarray, ...]:
   The area is half of that of the wall at the edge, along what is across it in both triangles.
   """
   twin = mesh.whole.twin
-  half = np.flatnonzero((mesh.twin < 0) & (np.arange(len(twin)) < twin))
+  half = topology.opened(mesh)
+  half = half[half < twin[half]]
   both = np.stack([half, twin[half]])
   both = (both - both % 3)[..., None] + (both[..., None] + np.arange(3)) % 3
   turn = axes(mesh.rest[mesh.elem.reshape(-1)[both]].reshape(-1, 3, 3)).reshape(2, -1, 3, 3)

@@ -95,14 +95,6 @@ def room(nskin: int, spare: int, solid: bool) -> tuple[int, int]:
   return walls[0] + profile * edges, walls[1] + 2 * (profile - 1) * edges
 
 
-def opened(mesh: topology.Mesh) -> np.ndarray:
-  """Returns the half-edges of an organ's own surface that cuts have opened, ascending."""
-  half = np.flatnonzero(mesh.whole.twin >= 0)
-  other = mesh.whole.twin[half]
-  apart = [topology.corners(mesh, half, k) != topology.corners(mesh, other, 1 - k) for k in (0, 1)]
-  return half[np.logical_or(*apart)]
-
-
 def _lips(mesh: topology.Mesh, x: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
   """Returns vertices [m] and triangles of the lips along edges that cuts have opened.
 
@@ -111,7 +103,7 @@ def _lips(mesh: topology.Mesh, x: np.ndarray, radius: float) -> tuple[np.ndarray
     x: its vertices [m]  (nvert, 3)
     radius: how far its surface is drawn outside and inside [m]
   """
-  half, elem = opened(mesh), mesh.elem[: mesh.whole.nelem]
+  half, elem = topology.opened(mesh), mesh.elem[: mesh.whole.nelem]
   vert, ends = np.unique([topology.corners(mesh, half, k) for k in (0, 1)], return_inverse=True)
   ends = ends.reshape(2, -1)
   out = np.zeros_like(x)  # as MuJoCo draws a flex

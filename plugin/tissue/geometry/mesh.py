@@ -193,6 +193,14 @@ def corners(mesh: Mesh, half: np.ndarray, k: int = 0) -> np.ndarray:
   return mesh.elem.reshape(-1)[half - half % 3 + (half + k) % 3]
 
 
+def opened(mesh: Mesh) -> np.ndarray:
+  """Returns the half-edges of an organ's own surface that cuts have opened, ascending."""
+  half = np.flatnonzero(mesh.whole.twin >= 0)
+  other = mesh.whole.twin[half]
+  apart = [corners(mesh, half, k) != corners(mesh, other, 1 - k) for k in (0, 1)]
+  return half[np.logical_or(*apart)]
+
+
 def around(mesh: Mesh, vert: np.ndarray) -> np.ndarray:
   """Returns the triangles that have a corner among these vertices, ascending."""
   if len(mesh.tet):
