@@ -13,11 +13,11 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from palpate.engine import rods
+from palpate.engine import layout, rods
 from palpate.engine.coupling import Ties
 from palpate.engine.rods import Rod
 from palpate.tissue.kernels import kernel
-from palpate.tissue.types import Array, also, doubles, fill, floats, ints
+from palpate.tissue.types import DIMS, Array, also, doubles, fill, floats, ints
 
 from . import base, kernels
 from .contact.contact_rows import Early, take_early
@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 
 _EACH = 2  # contacts of an edge with geoms, and as many more of a thread
 _BEYOND = 16
-_OF_DOFS = ("pushed", "accelerated")  # what a state has for each dof
 _LANES = 32  # threads of a world
+# What a state has for each dof.
+_OF_DOFS = {name for name, dims in DIMS[layout.RodState.key].items() if dims == ("nv",)}
 # What of these fields are those of `rods.Bound`.
 _OF_BOUND = ("flex", "rest", "dofadr", "qposadr", "bodyid", "massadr", "own_dof", "dof_tree",
              "geom_tree", "frame", "nv")  # fmt: skip
@@ -98,10 +99,10 @@ class Thread(base.Thread):
     mass = space.mass
     shared = space.constants | rods.settings(organ, space.friction) | {"mass": mass}
     shared["newton"] = min(shared["newton"], _ITERATIONS)
-    sizes = {"twist": n, "broken": n, "pushed": bare.nv, "accelerated": bare.nv, "signature": 1}
+    spans = layout.spans(layout.RodState, {"nvert": n, "nv": bare.nv})
     self.own = own = {
-      name: wp.zeros((nworld, size), dtype=wp.float64, device=device)
-      for name, size in sizes.items()
+      name: wp.zeros((nworld, span.stop - span.start), dtype=wp.float64, device=device)
+      for name, span in spans.items()
     }
     self.broken = own["broken"]
     scratch = rods.scratch(n, bare.nv).items()
