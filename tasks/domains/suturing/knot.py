@@ -330,7 +330,7 @@ class Tie:
     assert p.other
     self.task, self.p, self.thread = task, p, p.physics.thread
     self.hand = {1: p, -1: p.other}
-    self.dt, self.angle = p.dt, _START
+    self.dt = p.dt
 
   def held(self, side: int) -> int:
     """Returns the node that a hand holds."""
@@ -406,8 +406,7 @@ class Tie:
       lead = _PAST * past**2 * (3.0 - 2.0 * past) + _LEAD * (angle - start) / (2.0 * math.pi)
       other.tip = np.array([tip[0], 0.0, high])
       winds.tip = np.array([x + s * (lead - _GRIP), 0.0, high]) + _CIRCLE * out(angle)
-      self.angle = start + share * (angle - start)
-      winds.turn = _facing(s, self.angle)
+      winds.turn = _facing(s, start + share * (angle - start))
       yield self.step()
 
   def draw(self, s: int) -> Script:
