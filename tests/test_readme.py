@@ -136,6 +136,13 @@ def test_the_picture_is_small():
   assert (ROOT / "models" / "press" / "press.png").stat().st_size < 300e3
 
 
+# Prints by what name the cache of compiled kernels knows some of them.
+KERNELS = (
+  "import warp; from palpate.tissue import step; "
+  "print(warp.get_module('palpate.cpu.tissue.elastic').get_module_hash().hex())"
+)
+
+
 def test_the_wheel_holds_everything_and_runs_without_the_sources(tmp_path):
   pytest.importorskip("setuptools", "77")
   tree = tmp_path / "tree"
@@ -180,11 +187,14 @@ def test_the_wheel_holds_everything_and_runs_without_the_sources(tmp_path):
   assert (done.returncode, done.stderr) == (0, "")
   assert "contact force, static" in done.stdout
   where = subprocess.run(
-    [sys.executable, "-c", "import palpate; print(palpate.__file__)"],
+    [sys.executable, "-c", f"import palpate; print(palpate.__file__); {KERNELS}"],
     cwd=tmp_path,
     env=outside | {"PYTHONPATH": str(tmp_path / "site")},
     capture_output=True,
     text=True,
     timeout=60,
   )
-  assert where.stdout.startswith(str(tmp_path))
+  file, kernels = where.stdout.splitlines()
+  assert file.startswith(str(tmp_path))
+  here = subprocess.run([sys.executable, "-c", KERNELS], capture_output=True, text=True, timeout=60)
+  assert [kernels] == here.stdout.splitlines(), "would be compiled anew for each place"

@@ -166,14 +166,7 @@ def _module(header: str, kind: str, constants: tuple, tag: str) -> str:
   name = f"palpate.{kind}.{header.removesuffix('.h').replace('/', '.')}{tag}"
   known = MODULES[kind].setdefault(name, {})
   known |= dict(constants)
-  preamble = _constexpr(known) + f'\n#include "{header}"\n'
-  options = wp.ModuleBuildOptions(
-    extra_cpu_include_dirs=[str(NATIVE)],
-    extra_cuda_include_dirs=[str(NATIVE)],
-    extra_cpu_preamble=preamble,
-    extra_cuda_preamble=preamble,
-    extra_build_dependencies=[str(NATIVE / each) for each in _includes(header)],
-  )
+  options = wp.ModuleBuildOptions(**{f"extra_{kind}_preamble": _constexpr(known) + _text(header)})
   wp.set_module_options({"extra_build_options": options, "enable_backward": False}, name)
   return name
 
@@ -186,15 +179,25 @@ def _constexpr(constants: Mapping[str, int | float]) -> str:
     else f"constexpr int {name} = {int(value)};"
     for name, value in constants.items()
   ]
-  return "\n".join(["namespace palpate {", *lines, "}"])
+  return "\n".join(["namespace palpate {", *lines, "}\n"])
 
 
-def _includes(header: str) -> list[str]:
-  """Returns the header and those that it includes, each once."""
-  found, wanted = [], [header]
-  while wanted:
-    name = wanted.pop()
-    if name not in found:
-      found.append(name)
-      wanted += re.findall(r'#include "([\w/]+\.h)"', (NATIVE / name).read_text())
-  return sorted(found)
+def _text(header: str, seen: set[str] | None = None) -> str:
+  """Returns a header with those that it includes in their places, each once.
+
+  Warp's cache names a module by its text and options. A path among them, as of a folder of headers,
+  would have every checkout and environment compile its own.
+  """
+  seen = seen or set()
+  seen.add(header)
+
+  def included(line: re.Match) -> str:
+    return "" if line[1] in seen else _text(line[1], seen)
+
+  text = _read(header).replace("#pragma once\n", "")
+  return re.sub(r'^#include "([\w/]+\.h)"\n', included, text, flags=re.M)
+
+
+@functools.cache
+def _read(header: str) -> str:
+  return (NATIVE / header).read_text(encoding="utf-8")
