@@ -5,6 +5,7 @@ Everything returns text. It does not end in a newline, except for a file's.
 
 from __future__ import annotations
 
+import pathlib
 import textwrap
 from collections.abc import Mapping, Sequence
 
@@ -118,3 +119,10 @@ def obj(vertices: np.ndarray, triangles: np.ndarray, decimals: int = 6) -> str:
   lines = [" ".join(["v", *(f"{x + 0.0:.{decimals}f}" for x in v)]) for v in vertices]
   lines += [f"f {a} {b} {c}" for a, b, c in np.asarray(triangles) + 1]
   return "\n".join(lines) + "\n"
+
+
+def read_obj(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
+  """Returns vertices and triangles of a file that `obj` has written."""
+  lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+  vertices = np.array([line[1:] for line in lines if line[0] == "v"], float)
+  return vertices, np.array([line[1:] for line in lines if line[0] == "f"], int) - 1

@@ -11,14 +11,13 @@ import dataclasses
 import functools
 
 import numpy as np
-import trimesh
 from palpate.tissue.geometry import subdivide
 from palpate.tissue.geometry.mesh import vertex_areas, vertex_normals
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
-from . import catalog, laparoscope, markup, texture
+from . import catalog, laparoscope, markup, mjcf, texture
 from .meshing import grid
 
 # Axis of a texture's middle in the organ's frame: that of the exercises' laparoscopes.
@@ -48,9 +47,8 @@ class Surface:
 def _reference(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   """Returns an organ's committed mesh: vertices [m], triangles, and vertices on a unit sphere."""
   assets = markup.ROOT / name / "assets"
-  mesh = trimesh.load(assets / f"{name}.obj", process=False)
   sphere = np.loadtxt(assets / _SPHERE, delimiter=",", comments="#")
-  return np.array(mesh.vertices), np.array(mesh.faces), sphere  # pyright: ignore
+  return *mjcf.read_obj(assets / f"{name}.obj"), sphere
 
 
 def texcoord(name: str, vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -231,8 +229,7 @@ def main():
   """Writes the spheres of all organs."""
   for name in sorted(catalog.PLACES):
     assets = markup.ROOT / name / "assets"
-    mesh = trimesh.load(assets / f"{name}.obj", process=False)
-    sphere = _sphere(np.array(mesh.vertices), np.array(mesh.faces))  # pyright: ignore
+    sphere = _sphere(*mjcf.read_obj(assets / f"{name}.obj"))
     head = "vertices on a unit sphere: x, y, z; made by python -m palpate.models.scenery"
     np.savetxt(assets / _SPHERE, sphere, fmt="%.4f", delimiter=",", header=head)
     print(assets / _SPHERE)

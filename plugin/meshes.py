@@ -6,7 +6,6 @@ import math
 import os
 
 import numpy as np
-import trimesh
 
 KINDS = "obj, stl, ply, gltf, glb"
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
@@ -81,6 +80,8 @@ def _check_size(name: str, size: float, factor: float):
 
 
 def _load(name: str) -> tuple[np.ndarray, np.ndarray]:
+  import trimesh  # takes a fifth of the time of all imports, and only files of others need it
+
   if not os.path.exists(name):
     raise FileNotFoundError(f"{name}: no such file")
   try:

@@ -90,7 +90,7 @@ def hidden_needs() -> set[str]:
     name_of(modules()[a])
     for a, b, inside in imports()
     if inside and floor(a) < len(FLOORS) - 1 and a != "palpate" and b.partition(".")[0] in always
-    if b != "mujoco.viewer"  # wants a screen
+    if b not in ("mujoco.viewer", "trimesh")  # the first wants a screen, the second takes long
   }
 
 
