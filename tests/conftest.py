@@ -1,5 +1,6 @@
 """What all tests share."""
 
+import subprocess
 import sys
 
 import palpate  # noqa: F401 - before MuJoCo is imported: it chooses how to draw
@@ -10,6 +11,14 @@ from devices import needs_cuda
 
 def pytest_addoption(parser):
   parser.addoption("--seed", type=int, help="of the one fuzz case to run")
+
+
+def pytest_sessionstart(session):
+  """Compiles the kernels once, where each of several processes would."""
+  config = session.config
+  if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+    words = [sys.executable, "-m", "palpate", "warmup", "--device", "cpu"]
+    subprocess.run(words, stdout=subprocess.DEVNULL)
 
 
 def pytest_collection_modifyitems(config, items):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 from palpate import register
 
@@ -16,8 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 
 def main(args: argparse.Namespace) -> int:
-  """Loads every module with kernels on every device; prints the seconds each took."""
+  """Loads every module with kernels on every device, some at once; prints what each took."""
   register()
+  import palpate.batch  # noqa: F401 - declares the kernels of many worlds
   import warp as wp
   from palpate.tissue import device as devices
   from palpate.tissue import kernels
@@ -26,14 +29,22 @@ def main(args: argparse.Namespace) -> int:
   known = [device.alias for device in wp.get_devices()]
   if args.device and args.device not in known:
     raise CommandError(f"no device {args.device!r}, expected one of {', '.join(known)}")
-  progress, rows, total = Progress(), [], 0.0
-  for device in [args.device] if args.device else known:
-    for module in kernels.MODULES["cpu" if device == "cpu" else "cuda"]:
+  jobs = [
+    (device, module)
+    for device in ([args.device] if args.device else known)
+    for module in kernels.MODULES["cpu" if device == "cpu" else "cuda"]
+  ]
+
+  def load(job: tuple[str, str]) -> float:
+    start = time.perf_counter()
+    wp.load_module(job[1], device=job[0])
+    return time.perf_counter() - start
+
+  progress, rows, start = Progress(), [], time.perf_counter()
+  with ThreadPoolExecutor(os.cpu_count()) as pool:
+    for (device, module), seconds in zip(jobs, pool.map(load, jobs), strict=True):
       progress.show(f"{module.rpartition('.')[2]} on {device}", always=True)
-      start = time.perf_counter()
-      wp.load_module(module, device=device)
-      rows.append((f"{device}  {module}", f"{time.perf_counter() - start:.2f} s"))
-      total += time.perf_counter() - start
+      rows.append((f"{device}  {module}", f"{seconds:.2f} s"))
   progress.clear()
-  print(table([*rows, ("all", f"{total:.2f} s")]))
+  print(table([*rows, ("all", f"{time.perf_counter() - start:.2f} s")]))
   return 0

@@ -215,7 +215,7 @@ def test_doctor_reads_a_cache_that_others_write(monkeypatch, capsys, tmp_path):
 def test_warmup_prints_seconds_for_every_module(capsys):
   assert cli.main(["warmup", "--device", "cpu"]) == 0
   rows = dict(re.findall(r"cpu +palpate\.cpu\.[\w.]*?(\w+) +([\d.]+) s", capsys.readouterr().out))
-  assert {"elastic", "schemes", "pcg", "multigrid", "nodal", "proxies"} <= set(rows)
+  assert {"elastic", "schemes", "pcg", "multigrid", "nodal", "proxies", "world_rods"} <= set(rows)
 
 
 def test_warmup_names_the_devices_there_are(capsys):
