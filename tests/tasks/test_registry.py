@@ -72,30 +72,51 @@ def test_the_recipe_of_an_exercise_is_short_and_makes_one_for_one_world_and_for_
   assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize(
-  ("old", "new", "message"),
-  [
-    ('"hover/easy", 10, "easy"', '"Hover", 10', "exercise is 'Hover', expected \"domain/task\""),
-    ('"hover/easy", 10, "easy"', '"touch/easy", 10', "touch/easy: it is registered already, by"),
-    ('10, "easy"', '"10", "easy"', "hover/easy: time_limit is '10', expected a number > 0"),
-    ('10, "easy"', "-1", "hover/easy: time_limit is -1, expected a number > 0"),
-    ('"easy")', '"eazy")', "hover/easy: tag is 'eazy', expected one of easy, hard, bimanual"),
-    ('  """Hold the', '  f"""Hold the', "hover/easy: easy has no docstring"),
-    ('"held")', '"hold")', "hover.State: 'hold' is no field, expected one of control_timestep"),
-    ("held: float", "held: int", "hover.State: 'held' is told and <class 'int'>, expected float"),
-    ("goal: int", "goal: str", "hover.State: 'goal' is <class 'str'>, expected int, float"),
-    ("def observe(s, o):", "def observe(s):", "hover.State: observe is <function observe"),
-  ],
-)
-def test_what_is_malformed_is_an_error_at_import_that_names_the_entry_point(
-  tmp_path, old, new, message
-):
+MALFORMED = [
+  ('"hover/easy", 10, "easy"', '"Hover", 10', "exercise is 'Hover', expected \"domain/task\""),
+  ('"hover/easy", 10, "easy"', '"touch/easy", 10', "touch/easy: it is registered already, by"),
+  ('10, "easy"', '"10", "easy"', "hover/easy: time_limit is '10', expected a number > 0"),
+  ('10, "easy"', "-1", "hover/easy: time_limit is -1, expected a number > 0"),
+  ('"easy")', '"eazy")', "hover/easy: tag is 'eazy', expected one of easy, hard, bimanual"),
+  ('  """Hold the', '  f"""Hold the', "hover/easy: easy has no docstring"),
+  ('"held")', '"hold")', "hover.State: 'hold' is no field, expected one of control_timestep"),
+  ("held: float", "held: int", "hover.State: 'held' is told and <class 'int'>, expected float"),
+  ("goal: int", "goal: str", "hover.State: 'goal' is <class 'str'>, expected int, float"),
+  ("def observe(s, o):", "def observe(s):", "hover.State: observe is <function observe"),
+]
+# Imports the tasks in a copy of the process for each folder, which is first on its path.
+IMPORT = """
+import os
+import gymnasium, palpate.models
+for folder in folders:
+  if not os.fork():
+    sys.path.insert(0, folder)
+    sys.stderr = open(f"{folder}/said", "w")
+    import palpate.tasks
+    os._exit(0)
+  os.wait()
+"""
+
+
+@pytest.fixture(scope="module")
+def said(tmp_path_factory):
+  """Returns what the import of each malformed exercise says, by what is told of it."""
   text = re.search(r"^```python\n(.*?)^```", RECIPE, re.M | re.S)[1]
-  assert old in text
-  package(tmp_path, "hover", text.replace(old, new))
-  done = run(tmp_path, "import palpate.tasks")
-  assert done.returncode == 1 and message in done.stderr, done.stderr
-  assert "entry point 'hover' of palpate.tasks" in done.stderr
+  folders = {}
+  for old, new, message in MALFORMED:
+    folders[message] = tmp_path_factory.mktemp("malformed")
+    assert old in text
+    package(folders[message], "hover", text.replace(old, new))
+  names = [str(each) for each in folders.values()]
+  done = run(tmp_path_factory.mktemp("run"), f"folders = {names}", IMPORT)
+  assert done.returncode == 0, done.stderr
+  return {message: (folder / "said").read_text() for message, folder in folders.items()}
+
+
+@pytest.mark.parametrize("message", [message for _, _, message in MALFORMED])
+def test_what_is_malformed_is_an_error_at_import_that_names_the_entry_point(said, message):
+  assert message in said[message]
+  assert "entry point 'hover' of palpate.tasks" in said[message]
 
 
 def test_an_attribute_that_begin_forgets_is_named(tmp_path):
