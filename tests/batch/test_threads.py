@@ -1,11 +1,11 @@
 """Threads in batches: as under the plugin, on what does not move and on what hangs on them."""
 
-import engine.test_rods as one
 import mujoco
 import numpy as np
 import palpate.batch
 import pytest
 from devices import needs_cuda
+from scenes import rods as one
 
 DEVICES = ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
 

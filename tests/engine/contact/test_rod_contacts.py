@@ -4,39 +4,23 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-import trimesh
 from scenes.rods import (
   AREA,
   FREE,
   MASS,
   RADIUS,
   document,
+  draped,
+  drum,
   force,
+  hand,
   line,
   load,
   loaded,
+  needle,
   run,
+  shake,
 )
-
-
-def drum(friction, cone, kind="cylinder", h=1e-3):
-  """Returns a thread half around a drum, its left end to be loaded, its right end on a slide."""
-  radius, tail, n = 0.01, 0.03, 81
-  r = radius + RADIUS
-  s = np.linspace(0, np.pi * r + 2 * tail, n)
-  angle = np.clip(np.pi - (s - tail) / r, 0, np.pi)
-  below = np.maximum(tail - s, 0) + np.maximum(s - tail - np.pi * r, 0)
-  points = np.stack([r * np.cos(angle), 0 * s, r * np.sin(angle) - below], axis=1)
-  x, _, z = points[-1]
-  world = f"""<geom type="{kind}" size="{radius} .02" euler="90 0 0" friction="{friction} 0 0"/>
-    <body name="puller" pos="{x} 0 {z}"><joint name="pull" type="slide" axis="0 0 -1"/>
-    <geom size=".002" mass=".1" contype="0" conaffinity="0"/></body>"""
-  after = f"""<equality><connect body1="puller" body2="t_{n - 1}" anchor="0 0 0" solref=".002 1"/>
-    </equality><actuator><velocity joint="pull" kv="100"/></actuator>"""
-  contact = f'friction="{friction} 0 0" condim="3"'
-  option = f'cone="{cone}" {FREE}'
-  keys = dict(world=world, after=after, contact=contact, option=option, bend=0.01, h=h)
-  return document(points, **keys)
 
 
 def capstan(*args, **kwargs):
@@ -58,15 +42,6 @@ def test_a_thread_around_a_drum_obeys_the_capstan_law(friction, cone, kind):
   np.testing.assert_allclose(ratio, np.exp(friction * np.pi), rtol=0.03)
   tension = thread.tension
   assert tension[-1] / tension[0] == pytest.approx(np.exp(friction * np.pi), rel=0.03)
-
-
-def needle(mass, n=41):
-  """Returns a needle on the end of a thread, beside the point that it hangs on."""
-  world = f"""<body name="needle" pos=".08 0 0"><freejoint/><geom type="capsule" size=".0004"
-    fromto="0 0 0 .012 0 0" mass="{mass}" contype="0" conaffinity="0"/></body>"""
-  after = f"""<equality><connect body1="needle" body2="t_{n - 1}" anchor="0 0 0" solref=".002 1"/>
-    </equality>"""
-  return document(line(n, 0.08), pin=(0,), world=world, after=after, bend=0.02)
 
 
 @pytest.mark.parametrize("mass", [1e-4, 2e-2])
@@ -183,29 +158,6 @@ def test_jaws_that_close_on_a_thread_press_with_their_own_force(h, tension, slac
   assert thread.error is None
 
 
-def hand(n=41):
-  """Returns jaws that close on a thread in the middle, where an equality holds it."""
-  jaws = "".join(
-    f"""<body pos="0 0 {-way * 0.0014}"><joint name="jaw{k}" type="slide" axis="0 0 {way}"
-      damping="2"/><geom type="box" size="0.002 0.002 0.001" mass="0.02" friction="0.2"
-      solref="0.002 1"/></body>"""
-    for k, way in enumerate((-1, 1))
-  )
-  world = f"""<body name="hand" pos="0.01 0 0"><joint name="hand" type="slide" axis="0 1 0"
-    damping="5"/><geom size="0.001" mass="0.2" contype="0" conaffinity="0"/>{jaws}</body>"""
-  motors = "".join(f'<motor joint="{name}"/>' for name in ("hand", "jaw0", "jaw1"))
-  ties = f"""<equality><connect body1="hand" body2="t_{n // 2}" anchor="0 0 0"
-    solref="0.002 1"/></equality>"""
-  option = f'{FREE} cone="elliptic" impratio="10"'
-  after = f"<actuator>{motors}</actuator>{ties}"
-  return document(line(n, 0.02), option=option, world=world, after=after, bend=0.02)
-
-
-def shake(k):
-  """Returns the forces on a hand and its jaws in a step: 15 g there and back, and a grip of 5 N."""
-  return 30.0 * np.sign(np.sin(2 * np.pi * k / 50)), 5.0, 5.0
-
-
 def test_a_held_thread_does_not_meet_the_jaws_that_it_is_in():
   """Its whipping tails pull at it by 40 mN; against the jaws it would bear 50 N and be lost."""
   model, data, thread = loaded(hand())
@@ -241,26 +193,6 @@ def test_a_thread_comes_to_rest_on_a_floor():
   assert np.abs(data.qvel).max() < 1e-4
   weight = data.efc_force.sum() if data.nefc else 0.0
   assert weight == pytest.approx(MASS * 9.81, rel=0.02)  # pyramids share their normal force
-
-
-def draped(first="ball", nodes=None):
-  """Returns a thread over a soft ball, its ends hanging, and which of them comes first."""
-  spec = mujoco.MjSpec()
-  ball, r = trimesh.creation.icosphere(subdivisions=2, radius=0.03), 0.0313
-  low = np.flatnonzero(ball.vertices[:, 2] < -0.015)
-  mesh = np.array(ball.vertices), np.array(ball.faces)
-  s = np.linspace(-0.07, 0.07, 57)
-  angle = np.clip(s / r, -np.pi / 2, np.pi / 2)
-  below = np.abs(s - r * angle)
-  points = np.stack([r * np.sin(angle), 0 * s, r * np.cos(angle) - below], axis=1)
-  for name in dict.fromkeys((first, "ball", "t")):
-    if name == "t":
-      palpate.add_thread(spec, points, "t")
-    else:
-      palpate.add_organ(spec, mesh, "ball", young=1.5e4, elements="solid", pin=low)
-  if nodes:
-    palpate.add_windows(spec, "ball", nodes=nodes)
-  return spec
 
 
 def test_a_thread_over_an_organ_is_borne_by_it():
