@@ -11,6 +11,11 @@ from palpate.tasks.core import engine, performer, scenes
 from palpate.tasks.domains import grasp
 
 IDS = ["/".join(pair) for pair in tasks.ALL_TASKS]
+# Levels of an exercise are one text with other numbers: one of each, and at length all.
+LEVELS = [
+  pytest.param(name, marks=pytest.mark.slow) if name.endswith(("standard", "hard")) else name
+  for name in IDS
+]
 _cache = {}
 
 
@@ -80,6 +85,7 @@ def test_specs_and_observations(env):
       assert value.dtype == np.float64 and np.isfinite(value).all(), name
 
 
+@pytest.mark.parametrize("env", LEVELS, indirect=True)
 def test_a_seed_decides_everything(env):
   first = roll(env, 6)
   state = env.physics.integration_state()
@@ -95,6 +101,7 @@ def test_a_seed_decides_everything(env):
   assert not np.array_equal(other.observation["tip_pos"], first[0].observation["tip_pos"])
 
 
+@pytest.mark.parametrize("env", LEVELS, indirect=True)
 def test_rewards_are_finite_and_bounded_and_the_episode_can_start_anew(env):
   for _ in range(2):
     steps = roll(env, 8)
