@@ -37,6 +37,7 @@ def test_the_expert_ties_a_throw_and_replays_to_the_bit(tmp_path, level, name):
   found = made.metrics()
   assert found.final_gap < 1e-3
   assert 0.3 < found.peak_tension < 0.5 * STRENGTH  # it is drawn with 0.8 N
+  assert found.force_breaches == 0  # neither jaws that close nor a thread in them strike with 30 N
   old = Recording.load(made.save(tmp_path / "a.npz"))
   assert episode.differences(old, episode.replay(old)) == []
 

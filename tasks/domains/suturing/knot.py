@@ -3,8 +3,9 @@
 FLS task 5, once the needle is through, up to its first throw. The thread goes through the marks of
 the drain, see `drain`: its short tail stands free on the right, its long one is in the right hand.
 One hand winds the long tail around the other's jaws, once or twice, which take the short tail and
-draw it through; both hands draw the throw down. Further throws are not in it: the short tail hangs
-through the drain then, which the thread does not meet, and out of reach.
+draw it through; both hands draw the throw down. Further throws are not in it: outside of its holes
+the thread does not meet the drain, and a knot of two throws slides through the wall along a tail
+that is drawn straight. It then holds by the friction of the holes alone.
 
 Jaws that press on the thread hold it: an equality joins them to the node that is between them.
 Threads meet the jaws as round, smooth bodies, on which a loop slides off: the inserts, whose
@@ -112,7 +113,7 @@ class Knot(drain.Sewn):
       **kwargs: see Task
     """
     self.turns, self.lean, self.aside = turns, _LEAN, _ASIDE
-    # Jaws that close strike each other, and what they take, with 9 to 52 N in single steps.
+    # Jaws that close strike each other, and what they take, with 9 to 20 N in single steps.
     super().__init__(scene, random, **{"force_limit": 30.0, "damage": 60.0, **kwargs})
 
   def line(self) -> np.ndarray:
