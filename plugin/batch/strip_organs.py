@@ -63,15 +63,6 @@ def tools_of(model: mujoco.MjModel, organ: Declaration) -> np.ndarray:
   return found
 
 
-def nodes_under(model, organ: Declaration, tools: np.ndarray) -> np.ndarray:
-  """Returns about how many nodes of an organ each tool touches, and their neighbours."""
-  edge = organ.mesh.rest[organ.mesh.elem[:, [1, 2, 0]]] - organ.mesh.rest[organ.mesh.elem]
-  edge = float(np.linalg.norm(edge, axis=2).mean())
-  low, middle, large = np.sort(model.geom_aabb[tools, 3:], axis=1).T
-  r = 0.5 * (low + middle) + edge
-  return (math.pi * r * r + 2 * r * 2 * (large - middle)) / (math.sqrt(3) / 2 * edge * edge)
-
-
 def slots_for(model, organ: Declaration, tools: np.ndarray, lines: list[int], nodes) -> int:
   """Returns how many slots an organ has.
 
@@ -88,8 +79,16 @@ def slots_for(model, organ: Declaration, tools: np.ndarray, lines: list[int], no
     if isinstance(given, bool) or not isinstance(given, int) or not LEAST <= given <= MOST:
       raise ValueError(f"organ {organ.name!r}: nodes is {given!r}, expected [{LEAST}, {MOST}]")
     return min(given, nvert)
-  many = nodes_under(model, organ, tools).sum()
-  return int(min(MOST if lines else np.clip(math.ceil(many), 8, _USUAL), nvert))
+  if lines:
+    return min(MOST, nvert)
+  # About the nodes that each tool touches, and their neighbours.
+  edge = organ.mesh.rest[organ.mesh.elem[:, [1, 2, 0]]] - organ.mesh.rest[organ.mesh.elem]
+  edge = float(np.linalg.norm(edge, axis=2).mean())
+  low, middle, large = np.sort(model.geom_aabb[tools, 3:], axis=1).T
+  r = 0.5 * (low + middle) + edge
+  area = math.pi * r * r + 2 * r * 2 * (large - middle)
+  many = (area / (math.sqrt(3) / 2 * edge * edge)).sum()
+  return int(min(np.clip(math.ceil(many), 8, _USUAL), nvert))
 
 
 def lines_of(model, organ: Declaration, threads: list) -> list[int]:

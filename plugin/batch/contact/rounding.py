@@ -1,9 +1,14 @@
-"""What float32 leaves of mujoco_warp's Newton method where bodies are light, as threads' nodes are.
+"""What float32 leaves of mujoco_warp's Newton method.
 
-A tool's contact with a thread is a million times as stiff as its nodes are heavy. So an iteration's
-matrix may come out of its rounding as not positive, and has no factors: the search then goes down
-the gradient, each dof by its own curvature. And costs fall by less than they are rounded long
-before they fall by less than the tolerance that threads at rest need: then a world has arrived.
+Where no row has changed its state, mujoco_warp takes a step for exact and does not find the
+gradient again. But with firm contacts a step is off by what its factors are rounded, so forces by
+up to 1 % of their peak (`refined`).
+
+Bodies may be light, as threads' nodes are (`Rounding`). A tool's contact with a thread is a million
+times as stiff as its nodes are heavy. So an iteration's matrix may come out of its rounding as not
+positive, and has no factors: the search then goes down the gradient, each dof by its own curvature.
+And costs fall by less than they are rounded long before they fall by less than the tolerance that
+threads at rest need: then a world has arrived.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -80,6 +85,16 @@ def _check(s: Search):
     s.decrement[w] = total[1]
   elif s.decrement[w] < _ROUNDED * total[0]:
     s.decrement[w] = 0.0
+
+
+def refined() -> contextlib.AbstractContextManager[None]:
+  """Lets mujoco_warp's solver find the gradient in each iteration."""
+
+  def always(update):
+    return lambda *args, stable_fast=False, **kwargs: update(*args, **kwargs)
+
+  solver, names = private.solver, ("_update_constraint", "_update_gradient_incremental")
+  return private.instead([(solver, name, always(getattr(solver, name))) for name in names])
 
 
 class Rounding:
