@@ -116,7 +116,8 @@ class Cleaver(Native):
     sizes = {"nvert": nvert, "ntet": ntet, "nelem": whole.nelem}
     sizes |= {"most": whole.ring.shape[1], "most_elem": room, "nface": 4 * ntet}
     # What cutting/solid/solid_cut.h takes of scratch, see there.
-    sizes |= {"nint": 92 * ntet + 40 * nvert + 8 * room, "nreal": 70 * nvert + 26 * ntet + 3 * room}
+    sizes["nint"] = 92 * ntet + 40 * nvert + 8 * room
+    sizes["nreal"] = 70 * nvert + 26 * ntet + 18 * room
     sizes |= {"nmouth": 3 * (room - whole.nelem), "npath": 0, "nline": 0}
     fields = allocate(Cleaving, "cpu", sizes)
     fields.nskin, fields.nspare = whole.nskin, whole.spare

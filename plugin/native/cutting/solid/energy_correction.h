@@ -2,17 +2,19 @@
 //
 // Means over nodes are finer where a node has become two, and by convexity have no less energy at the same
 // positions. So where a cut has raised the energy, what came apart gives way along its forces until that is put
-// right: by some hundredths of an edge. Masses go with the tissue, from which what was moved at rest
+// right: by some hundredths of an edge. Its two sides do not pass through each other for that: as lips they would
+// give the energy back in the next steps. Masses go with the tissue, from which what was moved at rest
 // has another part then. Velocities keep momentum and angular momentum, and as much of what they have besides
 // as the energy allows.
 #pragma once
 #include "tissue/neohookean.h"
+#include "cutting/solid/solid_mesh.h"
 #include "cutting/transfer_state.h"
 
 namespace palpate {
 
 constexpr int GIVES_WAY = 40;  // at most
-constexpr int TURNS = 8;
+constexpr int TURNS = 8, ALONE = 4;  // the first of them
 constexpr double EVEN = 1e-9;  // of the kinetic energy, that counts as none
 constexpr double STEP_ALONE = 0.3;  // share of the way of a vertex that gives way alone
 
@@ -114,10 +116,66 @@ PALPATE void pull_patch(const S& m, const Neohookean& e, const double* disp, Pat
   }
 }
 
+// Two vertices of walls that were one before a cut, the unit normal from the first to the second, and how far apart
+// they are along it, at most 0: they come no closer.
+struct Lips { int a, b; D3 normal; double gap; };
+
+// The vertex on the other side of a wall that was one with a corner of its triangle.
+template <class S>
+PALPATE int across(const S& m, int triangle, int v) {
+  int from = 0;
+  for (int k = 0; k < 3; ++k)
+    if (m.elem[3 * triangle + k] == v) from = (int)m.of_tet[3 * triangle + k];
+  const int mate = (int)m.mate[m.face_of(triangle)];
+  for (int k = 0; k < 3; ++k)
+    if (m.whole_tet[corner_of(mate, k)] == m.whole_tet[from]) return m.face_vert(mate, k);
+  return v;
+}
+
+// Finds the lips that have one of some vertices; returns how many.
+template <class S>
+PALPATE int find_lips(const S& m, const double* disp, const Few& apart, Lips* out) {
+  const auto at = [&](int v) { return m.place(v) + load(disp + 3 * v); };
+  int count = 0;
+  for (int i = 0; i < apart.count; ++i) {
+    const int v = apart.list[i], first = count;
+    m.each_triangle(v, [&](int t) {
+      if (t < m.nelem) return;
+      const int w = across(m, t, v);
+      if (w == v || (w < v && apart.has(w))) return;
+      int k = first;
+      for (; k < count && out[k].b != w;) ++k;
+      if (k == count) out[count++] = {v, w, {0.0, 0.0, 0.0}, 0.0};
+      const auto* vert = m.elem + 3 * t;
+      out[k].normal += cross(at((int)vert[1]) - at((int)vert[0]), at((int)vert[2]) - at((int)vert[0]));
+    });
+    for (int k = first; k < count; ++k) {
+      out[k].normal = unit(out[k].normal);
+      const double gap = dot(at(out[k].b) - at(v), out[k].normal);
+      out[k].gap = gap < 0.0 ? gap : 0.0;
+    }
+  }
+  return count;
+}
+
+// Moves those of the lips that may back to where these are no closer than they were.
+template <class S>
+PALPATE void part_lips(const S& m, const Lips* lips, int count, const Few& apart, double* disp) {
+  for (int k = 0; k < count; ++k) {
+    double *a = disp + 3 * lips[k].a, *b = disp + 3 * lips[k].b;
+    const D3 off = m.place(lips[k].b) + load(b) - m.place(lips[k].a) - load(a);
+    const double over = lips[k].gap - dot(off, lips[k].normal), half = apart.has(lips[k].b) ? 0.5 : 0.0;
+    if (over <= 0.0) continue;
+    store(a, load(a) - ((1.0 - half) * over) * lips[k].normal);
+    store(b, load(b) + (half * over) * lips[k].normal);
+  }
+}
+
 // Lets vertices give way along their forces, all at once and each as if it moved alone (damped Jacobi), until the
 // energy is not above `most`; returns by how much it is, or below.
 template <class S>
-PALPATE double give_way(const S& m, const Neohookean& e, Patch& p, const Few& apart, double most, double* disp) {
+PALPATE double give_way(const S& m, const Neohookean& e, Patch& p, const Few& apart, const Lips* lips, int nlip,
+                        double most, double* disp) {
   double more = strain_patch(m, e, disp, p) - most;
   for (int round = 0; round < GIVES_WAY && more > 0.0; ++round) {
     pull_patch(m, e, disp, p);
@@ -125,9 +183,21 @@ PALPATE double give_way(const S& m, const Neohookean& e, Patch& p, const Few& ap
       const int v = apart.list[i], k = p.vert.place[v] - 1;
       store(disp + 3 * v, load(disp + 3 * v) + (STEP_ALONE / p.hard[k]) * p.force[k]);
     }
+    part_lips(m, lips, nlip, apart, disp);
     more = strain_patch(m, e, disp, p) - most;
   }
   return more;
+}
+
+// Adds the vertices of a patch that have no other tetrahedra, on which its forces are whole.
+template <class S, class L>
+PALPATE void widen(const S& m, const Patch& p, const L* pinned, Few& apart) {
+  for (int i = 0; i < p.vert.count; ++i) {
+    const int v = p.vert.list[i];
+    bool whole = !pinned[v];
+    m.each_corner(v, [&](int corner) { whole = whole && p.own.has(corner / 4); });
+    if (whole) apart.put(v);
+  }
 }
 
 // A motion without strain.
@@ -187,6 +257,7 @@ PALPATE bool correct_energy(const S& m, const Neohookean& e, const Moving& x, co
   Few apart = few(memory, m.nvert);
   const int nsplit = f.found.data[FOUND_SPLIT];
   double* part = memory.values(nsplit);
+  Lips* lips = (Lips*)memory.values(3 * (f.found.data[FOUND_TRIANGLES] - m.nelem) * (int)(sizeof(Lips) / sizeof(double)));
   if (memory.full) return false;
   for (int i = 0; i < nsplit; ++i) part[i] = f.share.data[i] * was.size[f.group.data[i]];
   for (int i = 0; i < nsplit; ++i) was.size[f.member.data[i]] = part[i], apart.put(f.member.data[i]);
@@ -197,9 +268,11 @@ PALPATE bool correct_energy(const S& m, const Neohookean& e, const Moving& x, co
     had += x.mass[v], has += x.mass[v] *= p.size[i] / was.size[v];
   }
   for (int i = 0; i < p.vert.count; ++i) x.mass[p.vert.list[i]] *= had / has;
+  int nlip = find_lips(m, x.disp, apart, lips);
   double ask = 0.0;  // by how much less strain energy than before is to be left for the motion
   for (int turn = 1; turn <= TURNS; ++turn) {
-    const double more = e.has ? give_way(m, e, p, apart, was.energy - ask, x.disp) - ask : 0.0;
+    if (turn == ALONE + 1) widen(m, p, f.pinned.data, apart), nlip = find_lips(m, x.disp, apart, lips);
+    const double more = e.has ? give_way(m, e, p, apart, lips, nlip, was.energy - ask, x.disp) - ask : 0.0;
     const bool rigid = turn == TURNS || !e.has || was.energy + more <= 0.0;
     const double over = keep_motion(m, x, p.vert, f.pinned.data, was.sums, more, rigid);
     if (rigid || !(over > EVEN * was.sums.energy)) break;

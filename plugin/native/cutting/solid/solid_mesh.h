@@ -40,6 +40,11 @@ struct Solid {
   PALPATE double quality(const D3* x) const { return quality_of(x); }
   PALPATE int face_vert(int face, int k) const { return (int)tet[corner_of(face, k)]; }
   PALPATE I* cells() const { return tet; }
+  // The face that a triangle is.
+  PALPATE int face_of(int triangle) const {
+    const I* corner = of_tet + 3 * triangle;
+    return (int)(corner[0] - corner[0] % 4 + 6 - corner[0] % 4 - corner[1] % 4 - corner[2] % 4);
+  }
   // A face of the tetrahedron of a corner, 0 to 2, that has its vertex; the face beside one, -1 for none.
   PALPATE int facet(int corner, int k) const { return other_corner(corner, k); }
   PALPATE int beside(int face) const { return triangle[face] >= 0 ? -1 : (int)mate[face]; }
