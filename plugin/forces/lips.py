@@ -83,15 +83,22 @@ class Lips(Force):
 
   def _values(self, mesh: Mesh) -> dict[str, np.ndarray]:
     """Returns the lists of `Lipped` for a mesh."""
-    side, facet, wide = _walls(mesh, self.host.config.thickness)
+    side, facet, part, wide = _walls(mesh, self.host.config.thickness)
     turned = (side[:, 0, 0] > side[:, 1, 0])[:, None]  # facets begin on either side
     sign, side = np.where(turned, -1, 1), np.where(turned[..., None], side[:, ::-1], side)
     key, first, number = np.unique(
       side[:, 0, 0] * mesh.nvert + side[:, 1, 0], return_index=True, return_inverse=True
     )
-    total, mean = np.bincount(number, topology.lengths(wide)), _sums(sign * wide, number)
+    total = np.bincount(number, topology.lengths(wide))
+    group, way = number, sign
+    if part is not None:  # a later cut must not turn normals along which lips have slid
+      begin, group = np.unique(part, return_index=True, return_inverse=True)[1:]
+      way = np.where((wide * wide[begin[group]]).sum(axis=1) < 0, -1, 1)[:, None]
+    mean = _sums(way * wide, group)
     for _ in range(_SMOOTH):  # over what is next to each other: lips of a rough mesh slide too
-      mean = _sums(sign * _sums(sign * mean[number], facet)[facet], number)
+      mean = _sums(way * _sums(way * mean[group], facet)[facet], group)
+    mean, own = mean[group[first]], _sums(sign * wide, number)
+    mean = np.where((mean * own).sum(axis=1)[:, None] < 0, -mean, mean)
     mean /= np.maximum(topology.lengths(mean), 1e-300)[:, None]
     keep = _lasting(np.stack([key // mesh.nvert, key % mesh.nvert], axis=1), total)
     corner, mean, total = side[first[keep]], mean[keep], total[keep]
@@ -106,18 +113,19 @@ class Lips(Force):
     }
 
 
-def _walls(mesh: Mesh, thickness: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _walls(mesh: Mesh, thickness: float) -> tuple[Any, ...]:
   """Returns what cuts have opened, by its corners.
 
   Returns:
     on both sides of a cut a triangle whose first corner is there (n, 2, 3), which facet that is of
-    (n,), and the area of the wall that it stands for, along its normal from the first side [m^2]
-    (n, 3)
+    (n,), of a solid the same number for what was one vertex before one cut (n,), and the area of
+    the wall that it stands for, along its normal from the first side [m^2] (n, 3)
   """
   if len(mesh.tet):
-    corner, (one, other, match, wide) = mesh.tet.reshape(-1), _faces(mesh)
+    corner, (one, other, match, part, wide) = mesh.tet.reshape(-1), _faces(mesh)
   else:
     corner, (one, other, match, wide) = mesh.elem.reshape(-1), _edges(mesh, thickness)
+    part = None
   count = match.shape[1]
   first = (np.arange(count)[:, None] + np.arange(3)) % 3
   second = (match[:, :, None] + np.arange(3)) % 3
@@ -125,22 +133,25 @@ def _walls(mesh: Mesh, thickness: float) -> tuple[np.ndarray, np.ndarray, np.nda
   side = np.stack([corner[one[:, first]], corner[other[there, second]]], axis=2).reshape(-1, 2, 3)
   wide = np.repeat(wide, count, axis=0)
   apart = side[:, 0, 0] != side[:, 1, 0]  # where a cut ends they are one
-  return side[apart], np.repeat(np.arange(len(one)), count)[apart], wide[apart]
+  part = None if part is None else part.reshape(-1)[apart]
+  return side[apart], np.repeat(np.arange(len(one)), count)[apart], part, wide[apart]
 
 
 def _faces(mesh: Mesh) -> tuple[np.ndarray, ...]:
   """Returns the faces that cuts of a solid have opened, a row a pair.
 
   Returns:
-    corners of both, numbered (n, 3), which of the second is each of the first (n, 3), and a third
-    of the first one's area, along its normal [m^2] (n, 3)
+    corners of both, numbered (n, 3), which of the second is each of the first (n, 3), the same
+    number for what was one vertex before one cut (n, 3), and a third of the first one's area, along
+    its normal [m^2] (n, 3)
   """
-  face, whole = faces.opened(mesh), mesh.whole
-  face = face[face < whole.mate[face]]
-  one, other = faces.corners(face), faces.corners(whole.mate[face])
-  was = whole.tet.reshape(-1)
+  face, was = faces.opened(mesh).reshape(-1, 2), mesh.whole.tet.reshape(-1)
+  ascends = face[:, 0] < face[:, 1]  # as in cutting/solid/open_faces.h
+  cut = np.append(False, ascends[1:] != ascends[:-1])[: len(face)].cumsum()
+  one, other = (faces.corners(each) for each in np.sort(face).T)
   match = (was[one][:, :, None] == was[other][:, None, :]).argmax(axis=2)
-  return one, other, match, topology.area_vectors(mesh.rest, mesh.tet.reshape(-1)[one]) / 3
+  wide = topology.area_vectors(mesh.rest, mesh.tet.reshape(-1)[one]) / 3
+  return one, other, match, cut[:, None] * mesh.nvert + was[one], wide
 
 
 def _edges(mesh: Mesh, thickness: float) -> tuple[np.ndarray, ...]:

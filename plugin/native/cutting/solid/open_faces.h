@@ -112,7 +112,8 @@ PALPATE bool fit(const S& m, Opening& o, int ntriangle, Scratch& memory) {
   }
 }
 
-// Opens the faces: vertices get their numbers, the new ones the place of the old, faces their triangles.
+// Opens the faces: vertices get their numbers, the new ones the place of the old, faces their triangles. The faces of
+// a pair are in ascending order in every other cut, in descending order in the others: so cuts can be told apart.
 template <class S>
 PALPATE void open_faces(const S& m, Opening& o, int ntriangle, Few& near) {
   const Parts& p = o.parts;
@@ -126,15 +127,13 @@ PALPATE void open_faces(const S& m, Opening& o, int ntriangle, Few& near) {
     if (k == 0 || p.vert[k - 1] != v) m.seat[v] = -1;
   }
   for (int k = 0; k < p.count; ++k) m.seat[p.name[k]] = p.first[k];
+  const bool descends = ntriangle > m.nelem && m.face_of(ntriangle - 2) < m.face_of(ntriangle - 1);
   for (int i = 0; i < o.nparting; ++i)
     for (int side = 0; side < 2; ++side) {
-      const int face = side ? (int)m.mate[o.parting[i]] : o.parting[i], t = ntriangle + 2 * i + side;
+      const int one = o.parting[i], two = (int)m.mate[one], t = ntriangle + 2 * i + side;
+      const int face = (one < two) == (side == descends) ? one : two;
       for (int k = 0; k < 3; ++k) m.of_tet[3 * t + k] = corner_of(face, k);
-    }
-  for (int i = 0; i < o.nparting; ++i)
-    for (int side = 0; side < 2; ++side) {
-      const int face = side ? (int)m.mate[o.parting[i]] : o.parting[i];
-      m.triangle[face] = ntriangle + 2 * i + side;
+      m.triangle[face] = t;
     }
   for (int i = 0; i < 3 * (ntriangle + 2 * o.nparting); ++i) m.elem[i] = m.tet[m.of_tet[i]];
   for (int i = 0; i < near.count; ++i) {
