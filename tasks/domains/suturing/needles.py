@@ -38,6 +38,12 @@ HELD, NEAR = 1.0, 0.008  # of jaws that hold the needle: least force [N], farthe
 LOST = 0.5  # how long nobody may hold it [s]
 MEETS = 8  # bit of what meets the needle, besides bit 1 of what meets the organ
 WIDE = 0.15  # action of the jaws: open
+# Where along the needle's arc, from its middle, two hands hold it, short of its taper, and how
+# their jaws are tilted, off the wall [rad].
+RIGHT, LEFT = (math.radians(-72.0), math.radians(-30.0)), (math.radians(58.0), math.radians(30.0))
+# Angle of the tip that comes out at which the left one takes it, as high as the right one then is
+# [rad], and most that an expert turns the needle before it looks at it again [rad].
+OUT, LOOK = math.radians(92.5), 0.6
 MARK = 0.0008  # radius of a mark, and how far above the wall it is [m]
 # Energy that it takes to open an area of the wall [J/m^2], and friction in it [N/m]; skin takes
 # 2500, liver 75 to 185 (10.1007/978-3-540-70521-5_18).
@@ -49,6 +55,7 @@ _SOLVED = 1e-12
 _OPENING = 0.056  # of each jaw, just off the wire [rad]
 _BITE = 0.0036  # from the tip of the jaws to the wire between them [m]
 _SPEED, _TURN, _CLOSE = 0.03, 1.2, 3.0  # of an expert's hand [m/s, rad/s] and jaws [1/s]
+_BACK, _UP, _HIGH = 0.01, 0.008, 0.006  # of hands off a needle, and of one over its mark [m]
 
 Pose = tuple[np.ndarray, np.ndarray]  # place [m] (3,), and frame in columns (3, 3)
 
@@ -129,15 +136,15 @@ class Needlework(Task):
   watch = ("drop", "unintended_contact")
   right_holds, left_holds = 1.0, 0.0  # as an episode begins
 
-  def meet(self, spec: mujoco.MjSpec) -> None:
-    """Lets the needle meet what the instruments meet the organ with, and solves its contacts."""
+  def meet(self, spec: mujoco.MjSpec, bit: int = MEETS) -> None:
+    """Lets what has a bit meet what instruments meet the organ with, and solves its contacts."""
     spec.option.tolerance = _SOLVED
     # By islands the Newton method of MuJoCo 4.0 leaves single steps unsolved, by up to 16 N.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     hands = tuple(prefix for prefix in (self.prefix, self.second) if prefix)
     for geom in spec.geoms:
       if geom.parent.name.startswith(hands) and geom.contype & 1:
-        geom.contype, geom.conaffinity = geom.contype | MEETS, geom.conaffinity | MEETS
+        geom.contype, geom.conaffinity = geom.contype | bit, geom.conaffinity | bit
 
   def take_up(
     self,
@@ -314,6 +321,63 @@ def carry(p: Performer, path: Callable[[float], Pose], angle: float | None = Non
       now_turned = aim @ between(first.T @ mat, np.eye(3), t)
     p.tip, p.turn = place + now_turned @ held, now_turned @ frame
     yield p.step()
+
+
+def approach(p: Performer, ends: np.ndarray, before: float) -> Script:
+  """Puts the needle over the first of two marks (2, 3), its tip by an angle before it [rad]."""
+  pos, mat = piercing(ends, -half_angle(ends) - before)
+  yield from carry(p, lambda t: (pos + np.array([0.0, 0.0, _HIGH]), mat))
+  yield from arrive(p)
+  yield from carry(p, lambda t: (pos, mat))
+  yield from arrive(p)
+
+
+def turn_on(p: Performer, ends: np.ndarray, end: float, most: float = LOOK) -> Script:
+  """Turns the needle about its circle through two marks (2, 3), towards an angle of its tip [rad].
+
+  It goes no further than an angle, since the needle's place in the jaws is looked at as it begins.
+  """
+  start = tip_angle(p.physics, ends)
+  stop = min(start + most, end)
+
+  def way(t: float) -> Pose:
+    return piercing(ends, start + t * (stop - start))
+
+  yield from carry(p, way, stop - start)
+  yield from arrive(p)
+
+
+def take(p: Performer, angle: float, tilt: float) -> Script:
+  """Takes the needle from behind, at an angle along its arc, with tilted jaws."""
+  p.extra[:] = WIDE
+  pos, mat = needle(p.physics)
+  goal, turn = grasp(p.trocar, pos, mat * (1, 1, -1), angle, p.turn, tilt)
+  yield from move_tip(p, goal + _away(turn), turn)
+  yield from arrive(p)
+  yield from move_tip(p, goal, turn)
+  yield from arrive(p)
+  yield from jaws(p, -1.0)
+  yield from p.wait(0.2)
+
+
+def let_go(p: Performer) -> Script:
+  """Opens the jaws and takes the hand back and aside."""
+  yield from jaws(p, WIDE)
+  yield from move_tip(p, p.tip + _away(p.turn), p.turn)
+  yield from move_tip(p, park(p.trocar)[0], p.turn)
+
+
+def park(port: Any) -> Pose:
+  """Returns a pose of a tip beside the wall, on the side of its port, jaws away from that."""
+  side, front = (math.copysign(1.0, x) for x in port.pos[:2])
+  back, across = np.array([0.0, front, 0.0]), np.array([0.0, 0.0, -1.0])
+  frame = np.column_stack([across, np.cross(back, across), back])
+  return np.array([side * 0.03, front * 0.03, 0.02]), frame
+
+
+def _away(turn: np.ndarray) -> np.ndarray:
+  """Returns the way of open jaws off the needle: back, and up from the wall [m]."""
+  return _BACK * turn[:, 2] + np.array([0.0, 0.0, _UP])
 
 
 def _steps(p: Performer, way: np.ndarray, angle: float) -> int:

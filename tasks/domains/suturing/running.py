@@ -69,32 +69,34 @@ from ...registry import exercise
 from .. import sheet
 from .needles import (
   FRICTION,
+  LEFT,
   LOST,
   MARK,
   MEETS,
+  OUT,
   QUARTER,
   RADIUS,
+  RIGHT,
   WALL,
-  WIDE,
   Hands,
-  Pose,
   Stitching,
+  approach,
   arc,
   arrive,
   carry,
-  grasp,
   grasped,
   half_angle,
-  jaws,
   left_grasp,
+  let_go,
   lowest,
-  move_tip,
-  needle,
   one,
   open_holes,
+  park,
   piercing,
   right_grasp,
+  take,
   tip_angle,
+  turn_on,
 )
 
 STITCHES, PITCH, BITE = 4, 0.006, 0.004  # [m]: between stitches, and from the edge of the cut
@@ -111,18 +113,12 @@ FIELD = Scene(
   second_port=(0.06, 0.1, 0.08), camera=(0.0, 0.04, 0.105), nodes=480,
 )  # fmt: skip
 _MASS, _SLOTS = 0.004, 160  # of the wall [kg], and of its window
-# Where along the needle's arc, from its middle, the hands hold it, short of its taper, and how
-# their jaws are tilted, off the wall [rad].
-_RIGHT, _LEFT = (math.radians(-72.0), math.radians(-30.0)), (math.radians(58.0), math.radians(30.0))
-# Of the expert: the angle of the tip that comes out at which it is taken, as high as the other hand
-# then is [rad], how high the needle is brought over the wall, how far a hand goes back and up [m],
-# and what it pulls with [N].
-_OUT, _HIGH, _BACK, _UP, _PULL = math.radians(92.5), 0.012, 0.01, 0.008, 0.7
+# Of the expert: how high the needle is brought over the wall [m], and what it pulls with [N].
+_HIGH, _PULL = 0.012, 0.7
 _MORE, _SHUT = 0.02, 0.7  # how the pull grows [N/s], and share of the limit at which it is enough
 _LITTLE, _DRAWN = 0.01, 0.03  # slack that is drawn in with care [m], and how fast more is [m/s]
-# How far it turns at once [rad], how high it is handed over [m], tension of a thread without slack
-# [N], and which way it is pulled.
-_LOOK, _OVER, _TAUT, _WAY = 0.6, 0.02, 0.3, np.array([0.6, 0.35, 0.72])
+# How high it is handed over [m], tension of a thread without slack [N], and which way it is pulled.
+_OVER, _TAUT, _WAY = 0.02, 0.3, np.array([0.6, 0.35, 0.72])
 
 
 @exercise("suture/running_easy", 40, "easy", "bimanual")
@@ -370,7 +366,7 @@ class Running(Stitching):
     self.closed = self.through = self.stitches = self.pierced = 0.0
     self.target, self.way, self.circle, self.middle = np.zeros((4, 3))
     self.gap = self.gap0 = widest(physics, self)
-    angle, tilt = _RIGHT
+    angle, tilt = RIGHT
     tip = self.take_up(physics, self.held, angle, lean=0.0, along=0.08, side=-1.0, tilt=tilt)
     self.start0 = float(np.linalg.norm(tip - place(physics, self, first)))
     self.aims = -1, np.zeros((2, 3))  # of the expert, see `_ends`
@@ -410,16 +406,16 @@ class Running(Stitching):
       if self.done == STITCHES:
         yield from one(p, p.other, self._pull(p.other, lambda: self.outcome is not None))
       elif self.right_holds and out and self.left_holds:
-        yield from one(p, p, _let_go(p))
+        yield from one(p, p, let_go(p))
       elif self.left_holds and out:
         yield from one(p, p.other, self._draw(p.other))
       elif self.left_holds and self.right_holds:
-        yield from one(p, p.other, _let_go(p.other))
+        yield from one(p, p.other, let_go(p.other))
       elif self.left_holds:
         yield from one(p, p.other, self._hand(p.other))
-        yield from one(p, p, self._take(p, *_RIGHT))
-      elif self.right_holds and out and self._angle(p) > _OUT - 0.1:
-        yield from one(p, p.other, self._take(p.other, *_LEFT))
+        yield from one(p, p, take(p, *RIGHT))
+      elif self.right_holds and out and self._angle(p) > OUT - 0.1:
+        yield from one(p, p.other, take(p.other, *LEFT))
       elif self.right_holds:
         yield from one(p, p, self._drive(p))
       else:
@@ -439,40 +435,12 @@ class Running(Stitching):
     """Returns the angle of the needle's tip, see `piercing`."""
     return tip_angle(p.physics, self._ends(p))
 
-  def _turn(self, p: Performer, end: float) -> Script:
-    """Turns the needle on about its circle; looks how the needle lies in the jaws meanwhile."""
-    start, ends = self._angle(p), self._ends(p)
-    stop = min(start + _LOOK, end)
-
-    def way(t: float) -> Pose:
-      return piercing(ends, start + t * (stop - start))
-
-    yield from carry(p, way, stop - start)
-    yield from arrive(p)
-
   def _drive(self, p: Performer) -> Script:
     """Puts the needle over the first mark, and turns it about its circle through both."""
     if self.holes <= 2 * self.done:
-      ends = self._ends(p)
-      pos, mat = piercing(ends, -half_angle(ends) - math.radians(14.0))
-      yield from carry(p, lambda t: (pos + np.array([0.0, 0.0, 0.006]), mat))
-      yield from arrive(p)
-      yield from carry(p, lambda t: (pos, mat))
-      yield from arrive(p)
-    while self.holes < 2 * self.done + 2 or self._angle(p) < _OUT - 0.02:
-      yield from self._turn(p, max(_OUT, self._angle(p) + 0.2))
-
-  def _take(self, p: Performer, angle: float, tilt: float) -> Script:
-    """Takes the needle from behind, at an angle along its arc, with tilted jaws."""
-    p.extra[:] = WIDE
-    pos, mat = needle(p.physics)
-    goal, turn = grasp(p.trocar, pos, mat * (1, 1, -1), angle, p.turn, tilt)
-    yield from move_tip(p, goal + _away(turn), turn)
-    yield from arrive(p)
-    yield from move_tip(p, goal, turn)
-    yield from arrive(p)
-    yield from jaws(p, -1.0)
-    yield from p.wait(0.2)
+      yield from approach(p, self._ends(p), math.radians(14.0))
+    while self.holes < 2 * self.done + 2 or self._angle(p) < OUT - 0.02:
+      yield from turn_on(p, self._ends(p), max(OUT, self._angle(p) + 0.2))
 
   def _draw(self, p: Performer) -> Script:
     """Turns the needle out of the wall, and draws the thread after it."""
@@ -482,7 +450,7 @@ class Running(Stitching):
       return self.holes == 2 * self.done + 2
 
     while inside() and self._angle(p) < end - 0.05:
-      yield from self._turn(p, end)
+      yield from turn_on(p, self._ends(p), end)
     while inside():  # not of a hole that is lost
       yield from p.line(p.tip + np.array([0.001, 0.0, 0.002]), 0.02)
     # Who has closed the cut pulls no harder, see below.
@@ -572,25 +540,3 @@ def _bow(start: np.ndarray, end: np.ndarray, angle: float) -> np.ndarray:
   middle = 0.5 * (start + end) - radius * math.cos(angle) * aside
   bow = middle + radius * (np.sin(turn) * along + np.cos(turn) * aside)
   return np.column_stack([bow[:, :2], np.maximum(bow[:, 2], 0.9 * _RISE)])
-
-
-def park(port: Any) -> Pose:
-  """Returns a pose of a tip beside the wall, jaws away from the port."""
-  side = math.copysign(1.0, port.pos[0])
-  back, across = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])
-  return np.array([side * 0.03, 0.03, 0.02]), np.column_stack(
-    [across, np.cross(back, across), back]
-  )
-
-
-def _let_go(p: Performer) -> Script:
-  """Opens the jaws and takes the hand back and aside."""
-  yield from jaws(p, WIDE)
-  yield from move_tip(p, p.tip + _away(p.turn), p.turn)
-  pos, _ = park(p.trocar)
-  yield from move_tip(p, pos, p.turn)
-
-
-def _away(turn: np.ndarray) -> np.ndarray:
-  """Returns the way of open jaws off the needle: back, and up from the wall [m]."""
-  return _BACK * turn[:, 2] + np.array([0.0, 0.0, _UP])
