@@ -5,6 +5,7 @@ through the mark at +x and out at -x, below the slit, along a chord of the drain
 """
 
 import functools
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -78,23 +79,34 @@ def drain(nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def build(
-  scene: Scene, line: np.ndarray, meets: int = HANDS, friction: float = FRICTION, **thread
+  scene: Scene,
+  line: np.ndarray,
+  meets: int = HANDS,
+  friction: float = FRICTION,
+  tough: float = TOUGH,
+  wall: Mapping[str, float] = LATEX,
+  needle: int = 0,
+  **thread,
 ) -> mujoco.MjSpec:
   """Returns the drain on its block with a thread, instruments, light and what is around.
 
-  The needle has been cut off the thread. The organ still knows the thread by it: see `sew`.
+  A needle that meets nothing has been cut off the thread. The organ still knows the thread by it:
+  see `sew`.
 
   Args:
     scene: what it plays in; its organ has about so many nodes
     line: the thread's nodes, from where the needle was to the other end [m]  (n, 3)
     meets: bits of what the thread meets: `HANDS` the instruments, 1 the drain
-    friction: of the thread in the drain [N/m]
+    friction: of needle and thread in the drain [N/m]
+    tough: energy that it takes to open an area of it [J/m^2]
+    wall: keys of its tissue
+    needle: bits of what the needle meets; 0 for none
     **thread: see `palpate.add_thread`
   """
   vertices, triangles, _ = drain(scene.nodes)
   foot = np.flatnonzero(vertices[:, 2] < 0.1 * HIGH)
   law = f"{BED} {mjcf.numbers(HELD)} at {' '.join(map(str, foot))}"
-  tissue = LATEX | {"needles": f"needle {TOUGH:g} {friction:g}", "bonds": law}
+  tissue = {**wall, "needles": f"needle {tough:g} {friction:g}", "bonds": law}
   flex = mjcf.flexcomp(
     ORGAN,
     (vertices, triangles),
@@ -116,12 +128,13 @@ def build(
       geom.contype, geom.conaffinity = geom.contype | BLOCK | HANDS, geom.conaffinity | HANDS
   contact = {"contype": meets, "conaffinity": meets, "margin": _MARGIN}
   palpate.add_thread(spec, line, THREAD, contact=contact, **thread)
-  aside = spec.worldbody.add_body(name="needle_holder")
+  aside = None if needle else spec.worldbody.add_body(name="needle_holder")
+  look = {} if needle else {"rgba": (0, 0, 0, 0)}
   palpate.add_needle(
     spec, parent=aside, thread=THREAD, pos=line[0] + (0.0, CIRCLE, 0.0),
-    contact={"contype": 0, "conaffinity": 0}, rgba=(0, 0, 0, 0),
+    contact={"contype": needle, "conaffinity": needle}, **look,
   )  # fmt: skip
-  spec.equality(f"needle_{THREAD}").active = False
+  spec.equality(f"needle_{THREAD}").active = bool(needle)
   return spec
 
 
@@ -194,8 +207,7 @@ class Sewn(Task):
     self.tension = float(physics.thread.tension.max())
     self.broken = bool(physics.thread.broken.any())
     self.whole = len(physics.organ.pinholes) == 2
-    if self.whole:
-      self.gap = gap(physics.nodes(), self.scene.nodes)
+    self.gap = gap(physics.nodes(), self.scene.nodes)
 
   def lost(self, physics: Physics) -> bool:
     """Returns whether the thread is broken or out of the drain: the exercise has failed then."""

@@ -66,7 +66,7 @@ _FIRM, _LOOSE = (0.004, 1.0, 0.9), (-1e-10, -1e-10, 1e-4)
 _LOOKS = 10  # control steps after which the knot is looked at
 # Of the expert. Where the thread is from the tip of jaws that hold it [m], actions of open jaws and
 # of those that hold.
-_GRIP, _OPEN, _HOLD = 0.0025, -0.278, -0.76
+_GRIP, _OPEN, HOLD = 0.0025, -0.278, -0.76
 # It winds on a circle about the jaws, from an angle that is 0 below them and 90 deg in front [rad],
 # at a rate [rad/s], by a turn and so much more, and turns its jaws by so much at most [rad].
 _CIRCLE, _START, _RATE = 0.0085, math.radians(160.0), math.radians(130.0)
@@ -79,6 +79,8 @@ _WINDS, _TURN, _GIVES = 0.08, 0.0084, 0.02
 # What both tails are drawn with, a little more than they are to bear [N]; fastest on the way [m/s].
 _DRAWS, _FAST = 0.8, 0.012
 _TRIES = 5  # at the short tail
+# From where it takes the long tail, and how far its jaws turn on the way [m, rad].
+_CLEAR, _BACKWARDS = 0.02, math.radians(135.0)
 X, Y, Z = np.eye(3)
 
 
@@ -130,7 +132,7 @@ class Knot(drain.Sewn):
     line = self.line()
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
     at = EDGE * np.arange(int(along[-1] / EDGE) + 1)
-    spec = drain.build(self._scene(variant), np.stack([np.interp(at, along, c) for c in line.T], 1))
+    spec = self.build(variant, np.stack([np.interp(at, along, c) for c in line.T], 1))
     spec.option.tolerance = _SOLVED
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     for prefix in (self.prefix, self.second):
@@ -143,11 +145,21 @@ class Knot(drain.Sewn):
       )  # fmt: skip
     return spec
 
+  def build(self, variant: int | None, nodes: np.ndarray) -> mujoco.MjSpec:
+    """Returns the drain and a thread with these nodes, see `drain.build`."""
+    return drain.build(self._scene(variant), nodes)
+
   def begin(self, physics: Physics) -> None:
     """Draws how the tails lie and where the left hand is; the right one holds the long tail."""
     super().begin(physics)
     self.lean = _LEAN + self.random.uniform(-0.15, 0.15, 3)
     self.aside = _ASIDE + self.random.uniform(-1.0, 1.0, 3) * _OFF
+    self.holds = [Hold(physics, hand) for hand in physics.hands]
+    self.tied, self.looked, self.stayed = False, 0, 0.0
+    self.place(physics)
+
+  def place(self, physics: Physics) -> None:
+    """Sews the thread, and puts the hands to it."""
     line = self.line()
     places = drain.sew(physics.organ, line).positions
     way = line[0] - line[1]
@@ -158,13 +170,11 @@ class Knot(drain.Sewn):
     physics.set_joints(wrist.inverse(physics.trocar(), held - _GRIP * X, _facing(1, _START), near))
     tip = _LEFT + self.random.uniform(-0.004, 0.004, 3)
     left.set_joints(wrist.inverse(left.trocar(), tip, _flat(-1)))
-    self.holds = [Hold(physics, hand) for hand in physics.hands]
     self.holds[0].take(places)
-    self.tied, self.looked, self.stayed = False, 0, 0.0
 
   def still(self, hand: int) -> np.ndarray:
     """Returns what keeps the jaws closed."""
-    return np.array([_HOLD])
+    return np.array([HOLD])
 
   def look(self, physics: Physics) -> None:
     """Finds what jaws hold, and now and then the throw."""
@@ -382,6 +392,19 @@ class Tie:
       hand.extra[0] = np.clip(goal, hand.extra[0] - most, hand.extra[0] + most)
       yield self.step()
 
+  def catch(self, s: int, node: int) -> Script:
+    """A hand takes the long tail at a node, turned so that it can wind it."""
+
+    def place() -> np.ndarray:
+      return self.thread.positions[node] - s * _GRIP * X
+
+    yield from self.jaws(s, _OPEN)
+    yield from self.go(1.0, {s: place() + s * _CLEAR * X}, {s: _facing(s, _START + _BACKWARDS)})
+    yield from self.go(1.0, {}, {s: lambda t: _facing(s, _START + (1.0 - t) * _BACKWARDS)})
+    yield from self.go(0.7, {s: place()})
+    yield from self.jaws(s, HOLD)
+    yield from self.wait(0.2)
+
   def wind(self, s: int, turns: int) -> Script:
     """A hand winds the long tail around the other's jaws.
 
@@ -424,7 +447,7 @@ class Tie:
         # The loops are 5 mm from the tip, and go where they are.
         move = goal - takes.tip + 0.005 * (turn - takes.turn)[:, 2]
         yield from self.go(duration, {-s: goal, s: winds.tip + move}, {-s: turn})
-      yield from self.jaws(-s, _HOLD)
+      yield from self.jaws(-s, HOLD)
       yield from self.wait(0.1)
       if self.held(-s) >= 0:
         break
