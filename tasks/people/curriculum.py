@@ -45,6 +45,8 @@ AFTER |= {
   "suture/extracorporeal_hard": "suture/extracorporeal_standard",
   "suture/knot_easy": "needle/transfer_easy",
   "suture/knot_standard": "suture/knot_easy",
+  "suture/stitch_easy": "suture/knot_easy",
+  "suture/stitch_standard": "suture/stitch_easy",
   "probe/palpate_hard": "probe/palpate_standard",
 }
 RULE = f"{CONSECUTIVE} proficient attempts in a row and {REPEATS} more"

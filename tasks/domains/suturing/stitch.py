@@ -80,11 +80,12 @@ _DRAG = 2e-3  # of the thread, as in water [N s/m^2]
 # Pull at which the needle comes off [N], and edges of the thread beside it that it is read from.
 # Needles that are made for it do so with 0.8 to 7 N (3 to 26 oz).
 _OFF, _BESIDE = 1.0, 6
-_AWAY = np.array([0.1, 0.0, -0.05])  # where a needle is that has been let go of [m]
+# A needle that is off and let go of for so long [s] is taken away: to there [m].
+_TAKEN, _AWAY = 0.1, np.array([0.1, 0.0, -0.05])
 # How the needle begins: its tip before the first mark [rad], off its circle through it, and how far
 # that is drawn [m]; how the thread does, away from both hands.
-_BEFORE, _OVER, _DRAWN = math.radians(40.0), np.array([0.003, 0.0, 0.008]), 0.003
-_TAIL = np.array([0.3, 0.8, 0.45])
+_BEFORE, _OVER, _DRAWN = math.radians(10.0), np.array([0.003, 0.0, 0.008]), 0.003
+_TAIL = np.array([-0.4, 0.3, 0.85])
 # Of the expert: the tip before the first mark, how far it turns at once, and out of the tube [rad];
 # what a tug takes from the thread's length in a second, and how far a hand goes aside [m].
 _NEAR, _LOOK, _THROUGH = math.radians(25.0), 0.3, math.radians(185.0)
@@ -144,7 +145,7 @@ class Stitch(Knot, Stitching):
     pos = pos + _OVER + self.random.uniform(-_DRAWN, _DRAWN, 3)
     angle, tilt = RIGHT
     pose = pos, mat
-    tip = self.take_up(physics, pose, angle, lean=0.15, along=0.08, side=-1.0, tilt=tilt)
+    tip = self.take_up(physics, pose, angle, lean=0.1, along=0.08, side=-1.0, tilt=tilt)
     self.start0 = float(np.linalg.norm(tip - self.marks[0]))
     tail = _TAIL + self.random.uniform(-0.15, 0.15, 3)
     swage = 2.0 * pos - tip
@@ -170,22 +171,25 @@ class Stitch(Knot, Stitching):
     self.whole = self.whole or not self.placed
     self.tied = self.tied and self.placed
     right, left = right_grasp(physics), left_grasp(physics)
-    joint = physics.data.ptr.joint("needle")
-    if self.attached:
-      grasped(physics, self, right, left)
-      assert physics.thread
-      if physics.thread.tension[:_BESIDE].min() > _OFF:
-        which = physics.model.ptr.equality(f"needle_{drain.THREAD}").id
-        physics.data.ptr.eq_active[which] = 0
-        self.attached = False
-        self.event(physics, "note", label="needle off its thread")
-    elif right + left == 0.0:  # somebody takes it
-      joint.qpos[:3], joint.qvel[:] = _AWAY, 0.0
+    if not self.attached:
+      self.loose = 0.0 if right + left else self.loose + self.control_timestep
+      if self.loose > _TAKEN:
+        joint = physics.data.ptr.joint("needle")
+        joint.qpos[:3], joint.qvel[:] = _AWAY, 0.0
+      return
+    grasped(physics, self, right, left)
+    assert physics.thread
+    if physics.thread.tension[:_BESIDE].min() > _OFF:
+      which = physics.model.ptr.equality(f"needle_{drain.THREAD}").id
+      physics.data.ptr.eq_active[which] = 0
+      self.attached = False
+      self.event(physics, "note", label="needle off its thread")
 
   def advance(self, physics: Physics) -> float:
     """Follows the stitch; see the module's head."""
     progress = super().advance(physics)
-    if self.outcome is None and (self.worst > self.tolerance or self.loose > LOST):
+    dropped = self.attached and self.loose > LOST
+    if self.outcome is None and (dropped or self.worst > self.tolerance):
       self.outcome = "missed"
       self.event(physics, "note", label=self.label("missed"))
     self.show(physics)

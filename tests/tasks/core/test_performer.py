@@ -20,7 +20,7 @@ LONG = {"probe/palpate_standard", "probe/palpate_hard"}
 LONG |= {"needle/transfer_standard", "needle/transfer_hard"}  # the first in tests/tasks
 LONG |= {f"suture/running_{level}" for level in ("easy", "standard", "hard")}
 LONG |= {f"suture/extracorporeal_{level}" for level in ("standard", "hard")}
-LONG |= {"suture/knot_easy", "suture/knot_standard"}  # in tests/tasks
+LONG |= {f"suture/{task}_{level}" for task in ("knot", "stitch") for level in ("easy", "standard")}
 LONG |= {
   f"{domain}/{task}" for domain in ("bimanual", "cut", "tease") for task in ("standard", "hard")
 }

@@ -1,0 +1,110 @@
+"""A stitch that two hands place and tie: what holds the needle, what counts, and what fails."""
+
+import mujoco
+import numpy as np
+import pytest
+from palpate.tasks import suite
+from palpate.tasks.batch.vector import Exercises, NotVectorisedError
+from palpate.tasks.core import episode, performer
+from palpate.tasks.domains.suturing import drain
+from palpate.tasks.metrics import knots
+from palpate.tasks.recording import Recording
+
+OPEN = 0.15  # action of the jaws
+STRENGTH = 9.4  # of silk of size 3-0 [N]
+
+
+def load(level="easy", **kwargs):
+  task_kwargs = {"random": 0, "surroundings": "none", **kwargs}
+  return suite.load("suture", f"stitch_{level}", task_kwargs=task_kwargs)
+
+
+def still(env, **jaws):
+  action = np.array(env.task.initial_action)
+  for name, value in jaws.items():
+    action[env.task.components.index(name)] = value
+  return action
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+  ("level", "name", "tolerance"), [("easy", "overhand", 2e-3), ("standard", "double throw", 1e-3)]
+)
+def test_the_expert_places_and_ties_a_stitch_and_replays_to_the_bit(
+  tmp_path, level, name, tolerance
+):
+  env = load(level)
+  made = episode.run(env, performer.make(env, seed=0), 0, {"task_kwargs": {"surroundings": "none"}})
+  assert made.outcome == "success"
+  assert knots.name(knots.closed(env.physics.thread.positions)) == name
+  holes = env.physics.organ.pinholes
+  assert len(holes) == 2 and all(hole.thread for hole in holes)
+  middle = drain.MIDDLE + np.outer([0.5, -0.5], [drain.BITE, 0.0, 0.0])
+  assert np.linalg.norm([h.rest - mark for h, mark in zip(holes, middle, strict=True)]) < tolerance
+  found = made.metrics()
+  assert found.final_gap < 1e-3
+  assert found.tearing < 1e-4 and found.regrasps == 1.0  # the left hand takes it
+  assert 1.0 < found.peak_tension < 0.5 * STRENGTH  # the needle comes off at 1 N
+  old = Recording.load(made.save(tmp_path / "a.npz"))
+  assert episode.differences(old, episode.replay(old)) == []
+
+
+@pytest.mark.parametrize("level", ["easy", "standard"])
+def test_an_episode_begins_with_a_needle_that_stays_in_the_right_hand(level):
+  env = load(level)
+  env.reset()
+  place = env.physics.data.ptr.joint("needle").qpos.copy()
+  for _ in range(10):
+    seen = env.step(still(env)).observation
+  assert seen["right_holds"] == seen["attached"] == 1.0
+  assert seen["left_holds"] == seen["pierced"] == seen["tied"] == 0.0
+  assert env.task.tension < 0.01 and seen["gap"] > 2e-3
+  np.testing.assert_allclose(env.physics.data.ptr.joint("needle").qpos[:3], place[:3], atol=5e-4)
+  assert env.physics.peak_force < 1e-3 and env.task.outcome is None
+
+
+def test_a_hole_off_its_mark_fails():
+  env = load(tolerance=1e-4)
+  act, step = performer.make(env, seed=0), env.reset()
+  while not step.last() and env.physics.time() < 3.0:
+    step = env.step(act(step))
+  assert env.task.outcome == "missed" and env.task.holes == 1
+  assert env.task.take_events()[-1].label == "a hole is too far from its mark"
+
+
+def test_a_needle_that_is_dropped_fails():
+  env = load()
+  env.reset()
+  for _ in range(40):
+    step = env.step(still(env, jaw=OPEN))
+    if step.last():
+      break
+  assert env.task.outcome == "missed"
+  assert env.task.take_events()[-1].label == "the needle was dropped"
+
+
+def test_the_needle_comes_off_by_a_tug_and_is_taken_away_once_it_is_let_go():
+  env = load()
+  env.reset()
+  for _ in range(10):
+    env.step(still(env))
+  model, data = env.physics.model.ptr, env.physics.data.ptr
+  body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{drain.THREAD}_10")
+  places = env.physics.thread.positions
+  way = (places[10] - places[0]) / np.linalg.norm(places[10] - places[0])
+  for pull, attached in ((0.7, 1.0), (1.5, 0.0)):
+    for share in (0.5, 0.75, 1.0, 1.0):
+      data.xfrc_applied[body, :3] = share * pull * way
+      seen = env.step(still(env)).observation
+    assert seen["attached"] == attached
+  data.xfrc_applied[:] = 0.0
+  assert np.linalg.norm(seen["needle"]) < 0.03  # in the jaws still
+  for _ in range(40):
+    step = env.step(still(env, jaw=OPEN))
+  assert not step.last()
+  assert np.linalg.norm(step.observation["needle"]) > 0.05
+
+
+def test_batches_refuse_it():
+  with pytest.raises(NotVectorisedError, match="rules of Stitch is None"):
+    Exercises(num_envs=1, task="suture/stitch_easy", device="cpu")
