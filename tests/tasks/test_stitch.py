@@ -49,9 +49,10 @@ def test_the_expert_places_and_ties_a_stitch_and_replays_to_the_bit(
   assert episode.differences(old, episode.replay(old)) == []
 
 
-@pytest.mark.parametrize("level", ["easy", "standard"])
-def test_an_episode_begins_with_a_needle_that_stays_in_the_right_hand(level):
-  env = load(level)
+# In 4 and 76 jaws that could not reach where they were to begin threw the needle.
+@pytest.mark.parametrize(("level", "seed"), [("easy", 4), ("easy", 76), ("standard", 0)])
+def test_an_episode_begins_with_a_needle_that_stays_in_the_right_hand(level, seed):
+  env = load(level, random=seed)
   env.reset()
   place = env.physics.data.ptr.joint("needle").qpos.copy()
   for _ in range(10):
@@ -59,7 +60,7 @@ def test_an_episode_begins_with_a_needle_that_stays_in_the_right_hand(level):
   assert seen["right_holds"] == seen["attached"] == 1.0
   assert seen["left_holds"] == seen["pierced"] == seen["tied"] == 0.0
   assert env.task.tension < 0.01 and seen["gap"] > 2e-3
-  np.testing.assert_allclose(env.physics.data.ptr.joint("needle").qpos[:3], place[:3], atol=5e-4)
+  np.testing.assert_allclose(env.physics.data.ptr.joint("needle").qpos[:3], place[:3], atol=1e-3)
   assert env.physics.peak_force < 1e-3 and env.task.outcome is None
 
 

@@ -34,6 +34,7 @@ MASS = 0.0003  # of the tube, 1000 kg/m^3 [kg]
 HELD = (1e8, 3e4, 60.0)
 _SKIN, _MARGIN = 2.5e-4, 6e-4  # radius of the flex; of the thread's contacts, which come early [m]
 _RGBA, _BLOCK = (0.86, 0.72, 0.42, 1.0), (0.022, 0.02, 0.003)
+_STEEL = (0.75, 0.77, 0.8, 1.0)
 HANDS, BLOCK = 8, 16  # bits of what meets instruments: the thread, and the block under the drain
 _SAMPLES = 4001  # of a section
 # Of vertices that a test pulls at: from the mark, and nearer to the slit, at most [m]; the angle of
@@ -129,10 +130,9 @@ def build(
   contact = {"contype": meets, "conaffinity": meets, "margin": _MARGIN}
   palpate.add_thread(spec, line, THREAD, contact=contact, **thread)
   aside = None if needle else spec.worldbody.add_body(name="needle_holder")
-  look = {} if needle else {"rgba": (0, 0, 0, 0)}
   palpate.add_needle(
     spec, parent=aside, thread=THREAD, pos=line[0] + (0.0, CIRCLE, 0.0),
-    contact={"contype": needle, "conaffinity": needle}, **look,
+    contact={"contype": needle, "conaffinity": needle}, rgba=_STEEL if needle else (0, 0, 0, 0),
   )  # fmt: skip
   spec.equality(f"needle_{THREAD}").active = bool(needle)
   return spec

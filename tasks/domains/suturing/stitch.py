@@ -149,7 +149,8 @@ class Stitch(Knot, Stitching):
     self.start0 = float(np.linalg.norm(tip - self.marks[0]))
     tail = _TAIL + self.random.uniform(-0.15, 0.15, 3)
     swage = 2.0 * pos - tip
-    palpate.Thread(physics.model.ptr, physics.data.ptr, drain.THREAD).lay([swage, swage + tail])
+    thread = palpate.Thread(physics.model.ptr, physics.data.ptr, drain.THREAD)
+    thread.lay(np.array([swage, swage + tail]))
     left = physics.hands[1]
     place, turn = park(left.trocar())
     place = place + self.random.uniform(-0.005, 0.005, 3)
