@@ -128,7 +128,8 @@ def build(
     if geom.parent.name.startswith(tuple(filter(None, scene.prefixes))) and geom.contype & 1:
       geom.contype, geom.conaffinity = geom.contype | BLOCK | HANDS, geom.conaffinity | HANDS
   contact = {"contype": meets, "conaffinity": meets, "margin": _MARGIN}
-  palpate.add_thread(spec, line, THREAD, contact=contact, **thread)
+  # Jaws that close on a throw may take 450: its forces would be out of balance, and harm the drain.
+  palpate.add_thread(spec, line, THREAD, contact=contact, iterations=1000, **thread)
   aside = None if needle else spec.worldbody.add_body(name="needle_holder")
   palpate.add_needle(
     spec, parent=aside, thread=THREAD, pos=line[0] + (0.0, CIRCLE, 0.0),
