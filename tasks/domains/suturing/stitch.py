@@ -78,7 +78,7 @@ _TOUGH, _FRICTION = 1200.0, 100.0  # [J/m^2], [N/m]
 _MEETS = 64  # bit of what meets the needle, beside bit 1 of the tube
 _DRAG = 2e-3  # of the thread, as in water [N s/m^2]
 # Pull at which the needle comes off [N], and edges of the thread beside it that it is read from.
-# Needles that are made for it do so with 0.8 to 7 N (3 to 26 oz).
+# Needles that are made for it do so with 0.3 to 7 N (1 to 26 oz, patent CA 1042301).
 _OFF, _BESIDE = 1.0, 6
 # A needle that is off and let go of for so long [s] is taken away: to there [m].
 _TAKEN, _AWAY = 0.1, np.array([0.1, 0.0, -0.05])
