@@ -35,7 +35,7 @@ const GERMAN = {
   // Domains, and the words that levels are made of.
   "touch/": "Berühren", "probe/": "Drücken und Tasten", "trace/": "Nachfahren", "grasp/": "Greifen", "retract/": "Weghalten", "tease/": "Ablösen",
   "dissect/": "Abpräparieren", "cut/": "Schneiden", "bimanual/": "Mit zwei Händen", "navigate/": "Kamera führen", "needle/": "Nadel übergeben", "suture/": "Nähen",
-  "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate": "tasten", "drive": "durchstechen", "running": "fortlaufend", "transfer": "übergeben", "extracorporeal": "Knoten hinunterschieben", "knot": "knoten",
+  "easy": "leicht", "standard": "mittel", "hard": "schwer", "depth": "Tiefe", "palpate": "tasten", "drive": "durchstechen", "running": "fortlaufend", "stitch": "Stich", "transfer": "übergeben", "extracorporeal": "Knoten hinunterschieben", "knot": "knoten",
   // What exercises ask for.
   "touch one point within # mm": "berühre einen Punkt auf # mm genau", "touch four points within # mm": "berühre vier Punkte auf # mm genau",
   "touch six points within # mm, on livers that vary": "berühre sechs Punkte auf # mm genau, auf wechselnden Lebern",
@@ -79,6 +79,9 @@ const GERMAN = {
   "push one throw down, and close the slit to # mm": "schiebe einen Wurf hinunter und schließe den Schlitz auf # mm",
   "tie one throw with two needle drivers, and close the slit to # mm": "knüpfe einen Wurf mit zwei Nadelhaltern und schließe den Schlitz auf # mm",
   "tie a double throw, the first one of a surgeon's knot": "knüpfe einen doppelten Wurf, den ersten eines chirurgischen Knotens",
+  "drive a needle through both lips of a slit within # mm of its marks, and tie one throw":
+    "stich eine Nadel durch beide Lippen eines Schlitzes, auf # mm genau an seine Marken, und knüpfe einen Wurf",
+  "drive it within # mm, as FLS asks for, and tie a double throw": "stich sie auf # mm genau, wie FLS es verlangt, und knüpfe einen doppelten Wurf",
   "push down two throws, a square knot that holds # N": "schiebe zwei Würfe hinunter, einen Kreuzknoten, der # N hält",
   "push down three throws, the first double, a surgeon's knot that holds # N": "schiebe drei Würfe hinunter, den ersten doppelt, einen chirurgischen Knoten, der # N hält",
   // What runs.
@@ -153,6 +156,8 @@ const GERMAN = {
   "Take the needle's tip with the left hand, and draw it through": "Nimm die Nadelspitze mit der linken Hand und ziehe sie durch",
   "Pull the thread until the cut is closed, and hold it": "Ziehe am Faden, bis der Schnitt zu ist, und halte ihn",
   "Turn the needle about its circle, to the yellow mark": "Drehe die Nadel um ihren Kreis, zur gelben Marke", "Turn it on until the tip is out": "Drehe weiter, bis die Spitze heraus ist",
+  "Draw the thread up until # cm are left, and take it # cm below the needle": "Ziehe den Faden hoch, bis noch # cm übrig sind, und nimm ihn # cm unter der Nadel",
+  "Pull the needle off its thread": "Ziehe die Nadel von ihrem Faden ab",
   "Take the long tail": "Nimm das lange Ende", "Draw both tails apart until the slit is closed": "Ziehe beide Enden auseinander, bis der Schlitz zu ist",
   "Wind the long tail once around the other jaws, take the short tail with them, and draw it through":
     "Wickle das lange Ende einmal um die anderen Backen, nimm das kurze damit und ziehe es hindurch",
