@@ -128,7 +128,8 @@ def build(
     if geom.parent.name.startswith(tuple(filter(None, scene.prefixes))) and geom.contype & 1:
       geom.contype, geom.conaffinity = geom.contype | BLOCK | HANDS, geom.conaffinity | HANDS
   contact = {"contype": meets, "conaffinity": meets, "margin": _MARGIN}
-  # Jaws that close on a throw may take 450: its forces would be out of balance, and harm the drain.
+  # A step in which jaws close on a throw took 451 iterations. One that is cut off leaves forces out
+  # of balance, which harm the drain.
   palpate.add_thread(spec, line, THREAD, contact=contact, iterations=1000, **thread)
   aside = None if needle else spec.worldbody.add_body(name="needle_holder")
   palpate.add_needle(

@@ -17,7 +17,6 @@ for half a second, a force of the needle on the wall above the damage limit, or 
 """
 
 import dataclasses
-import functools
 import math
 from typing import Annotated, Any
 
@@ -60,11 +59,9 @@ from .needles import (
   TOUGH,
   WALL,
   Hands,
-  Pose,
   Stitching,
+  approach,
   arc,
-  arrive,
-  carry,
   grasped,
   half_angle,
   lowest,
@@ -72,6 +69,7 @@ from .needles import (
   piercing,
   right_grasp,
   tip_angle,
+  turn_on,
 )
 
 BITE = 0.012  # between the marks [m]; FLS: 5 mm on either side of a slit
@@ -81,9 +79,8 @@ FIELD = Scene(
 )
 _MASS, _SLOTS = 0.004, 120  # of the wall [kg], and of its window
 _HELD_AT = math.radians(-65.0)  # along the arc from its middle [rad]
-# Of the expert: over the wall [m], the tip's way out at the end [m], and how far it turns at once
-# [rad].
-_OVER, _MORE, _LOOK = 0.012, 0.0015, 0.6
+# How high over the wall it begins, and of the expert the tip's way out at the end beyond that [m].
+_OVER, _MORE = 0.012, 0.0015
 
 
 @exercise("suture/drive_easy", 20, "easy")
@@ -247,22 +244,8 @@ class Drive(Stitching):
 
   def expert(self, p: Performer) -> Script:
     """Puts the needle over the first mark, and turns it about its circle through both."""
-    half = half_angle(self.marks)
-    start, end = -half - math.radians(12.0), half + (WANTED + _MORE) / RADIUS
+    end = half_angle(self.marks) + (WANTED + _MORE) / RADIUS
     if not self.holes:
-      over = piercing(self.marks, start)
-      yield from carry(p, lambda t: (over[0] + np.array([0.0, 0.0, 0.006]), over[1]))
-      yield from arrive(p)
-      yield from carry(p, lambda t: over)
-    while True:  # looking again how the needle lies in the jaws
-      yield from arrive(p)
-      now = tip_angle(p.physics, self.marks)
-      if now > end - 0.01:
-        return
-      stop = min(now + _LOOK, end)
-      yield from carry(p, functools.partial(_turned, self, now, stop), stop - now)
-
-
-def _turned(task: Drive, start: float, stop: float, t: float) -> Pose:
-  """Returns the pose of a needle that is a share of the way between two angles of its tip."""
-  return piercing(task.marks, start + t * (stop - start))
+      yield from approach(p, self.marks, math.radians(12.0))
+    while tip_angle(p.physics, self.marks) <= end - 0.01:
+      yield from turn_on(p, self.marks, end)

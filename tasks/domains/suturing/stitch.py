@@ -87,7 +87,7 @@ _TAKEN, _AWAY = 0.1, np.array([0.1, 0.0, -0.05])
 _BEFORE, _OVER, _DRAWN = math.radians(10.0), np.array([0.003, 0.0, 0.008]), 0.003
 _TAIL = np.array([-0.4, 0.3, 0.85])
 # Of the expert: the tip before the first mark, how far it turns at once, and out of the tube [rad];
-# what a tug takes from the thread's length in a second, and how far a hand goes aside [m].
+# how fast a hand tugs at the needle [m/s], and how far it goes aside then [m].
 _NEAR, _LOOK, _THROUGH = math.radians(25.0), 0.3, math.radians(185.0)
 _TUG, _ASIDE = 0.02, 0.03
 
@@ -144,8 +144,7 @@ class Stitch(Knot, Stitching):
     pos, mat = piercing(self.marks, -half_angle(self.marks) - _BEFORE)
     pos = pos + _OVER + self.random.uniform(-_DRAWN, _DRAWN, 3)
     angle, tilt = RIGHT
-    pose = pos, mat
-    tip = self.take_up(physics, pose, angle, lean=0.1, along=0.08, side=-1.0, tilt=tilt)
+    tip = self.take_up(physics, (pos, mat), angle, lean=0.1, along=0.08, side=-1.0, tilt=tilt)
     self.start0 = float(np.linalg.norm(tip - self.marks[0]))
     tail = _TAIL + self.random.uniform(-0.15, 0.15, 3)
     swage = 2.0 * pos - tip
