@@ -17,7 +17,7 @@ SIZE, SECONDS = (250, 400), 1.0
 # Levels that begin alike are drawn where their last throw waits over the others.
 LATER = {"suture_extracorporeal_standard": 2.3, "suture_extracorporeal_hard": 4.3}
 LATER |= {"suture_knot_easy": 4.0, "suture_knot_standard": 6.0}
-LATER |= {"suture_stitch_easy": 2.2, "suture_stitch_standard": 9.0}
+LATER |= {"suture_stitch_easy": 5.0, "suture_stitch_standard": 25.0}
 
 for domain, task in tasks.ALL_TASKS:
   name = f"{domain}_{task}"

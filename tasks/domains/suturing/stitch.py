@@ -70,7 +70,7 @@ from .needles import (
 
 FIELD = Scene(
   instrument="psm", second="psm", port=(0.06, -0.1, 0.08), second_port=(-0.06, -0.1, 0.08),
-  camera=(0.0, -0.05, 0.085), nodes=400,
+  camera=(0.0, -0.1, 0.06), nodes=400,
 )  # fmt: skip
 # Soft silicone on foam, how tough it is, and friction in it; ours.
 _WALL = {"young": 5e5, "thickness": 0.001, "damping": 0.003, "foundation": 3e6}
