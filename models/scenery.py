@@ -11,11 +11,9 @@ import dataclasses
 import functools
 
 import numpy as np
+import scipy
 from palpate.tissue.geometry import subdivide
 from palpate.tissue.geometry.mesh import vertex_areas, vertex_normals
-from scipy.interpolate import CubicSpline
-from scipy.spatial import KDTree
-from scipy.spatial.distance import cdist
 
 from . import catalog, laparoscope, markup, mjcf, texture
 from .meshing import grid
@@ -73,7 +71,7 @@ def _carry(name: str, vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray
     np.concatenate([x, _NORMAL * vertex_normals(x, t)], axis=1)
     for x, t in ((own, elem), (vertices, triangles))
   ]
-  away, near = KDTree(features[0]).query(features[1], k=4)
+  away, near = scipy.spatial.KDTree(features[0]).query(features[1], k=4)
   share = 1 / (away + 1e-6) ** 2
   out = np.einsum("nk,nkd->nd", share, sphere[near])
   tail, head = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
@@ -120,7 +118,7 @@ def tube(points, radii, sides: int = 12, along: int = 30) -> Surface:
   points, radii = np.asarray(points, float), np.asarray(radii, float)
   knots = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
   t = np.linspace(0, knots[-1], along)
-  curve = CubicSpline(knots, points)
+  curve = scipy.interpolate.CubicSpline(knots, points)
   tangent = curve(t, 1) / np.linalg.norm(curve(t, 1), axis=1, keepdims=True)
   side = np.cross(tangent, [0.3, 0.5, 0.8])
   side /= np.linalg.norm(side, axis=1, keepdims=True)
@@ -192,10 +190,11 @@ def balls(surface: Surface, count: int) -> tuple[np.ndarray, np.ndarray]:
   """
   x, normal = surface.vertices, vertex_normals(surface.vertices, surface.triangles)
   height = (x * normal).sum(axis=1)[:, None] - normal @ x.T - _POKE  # below each vertex
-  radii = np.where(height > 0, cdist(x, x, "sqeuclidean") / (2 * np.maximum(height, 1e-9)), _ROUND)
+  squared = scipy.spatial.distance.cdist(x, x, "sqeuclidean")
+  radii = np.where(height > 0, squared / (2 * np.maximum(height, 1e-9)), _ROUND)
   radii = radii.min(axis=1)
   centers = x - radii[:, None] * normal
-  gap = cdist(centers, x) - radii[:, None]
+  gap = scipy.spatial.distance.cdist(centers, x) - radii[:, None]
   near, left = (np.abs(gap) < _NEAR).astype(float), vertex_areas(x, surface.triangles)
   chosen = []
   for _ in range(count):  # `left` is the area that none is near to yet

@@ -15,8 +15,7 @@ import functools
 from collections.abc import Callable
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial import KDTree
+import scipy
 
 from .meshing.field import Field, Implicit, project, tabulate
 from .meshing.grid import shrink
@@ -64,10 +63,10 @@ def tube(points, radii) -> Implicit:
   points, radii = np.asarray(points, float), np.asarray(radii, float)
   knots = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
   t = np.linspace(0, knots[-1], 400)
-  curve, radius = CubicSpline(knots, points), CubicSpline(knots, radii)
+  curve, radius = (scipy.interpolate.CubicSpline(knots, of) for of in (points, radii))
   center, tangent, r, slope = curve(t), curve(t, 1), radius(t), radius(t, 1)
   tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-  tree, half = KDTree(center), (t[1] - t[0]) / 2
+  tree, half = scipy.spatial.KDTree(center), (t[1] - t[0]) / 2
 
   def implicit(x):
     i = tree.query(x)[1]
@@ -178,7 +177,7 @@ def patches(name: str, vertices: np.ndarray, seed: Seed = None) -> dict[str, np.
   for patch, (line, radius) in shape.patches.items():
     at = np.linspace(0, len(line) - 1, 40)
     points = np.stack([np.interp(at, np.arange(len(line)), x) for x in line.T], axis=1)
-    distance = KDTree(project(shape.implicit, points, steps=20)).query(vertices)[0]
+    distance = scipy.spatial.KDTree(project(shape.implicit, points, steps=20)).query(vertices)[0]
     third = np.sort(distance)[2]
     out[patch] = np.flatnonzero(distance <= max(radius, third))
   return out

@@ -15,10 +15,10 @@ import pathlib
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 from palpate.tissue.reading import choices
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import KDTree
 
 SIZE = 256  # [pixels]
 _WAVES = 20  # of an octave of noise
@@ -141,7 +141,7 @@ def _noise(points: np.ndarray, pace: float, look: Look, random) -> np.ndarray:
 
 def _lobules(at: np.ndarray, count: int, random) -> np.ndarray:
   """Returns the brightness of fat: cells that are darker where they meet (Worley 1996)."""
-  tree = KDTree(random.uniform(size=(count * count, 2)), boxsize=1)
+  tree = scipy.spatial.KDTree(random.uniform(size=(count * count, 2)), boxsize=1)
   first, second = tree.query(at, k=2)[0].T
   return 1.03 - 0.10 * np.exp(-(((second - first) * count / 0.3) ** 2)) - 0.06 * first * count
 
@@ -158,7 +158,7 @@ def _vessels(points: np.ndarray, look: Look, random) -> np.ndarray:
   place, radius = np.concatenate(place), np.maximum(np.concatenate(radius), thin)
   radius *= 2 if look.round else 1
   boxsize = None if look.round else 1
-  tree = KDTree(place if look.round else place % 1, boxsize=boxsize)
+  tree = scipy.spatial.KDTree(place if look.round else place % 1, boxsize=boxsize)
   away, near = tree.query(points, k=4, distance_upper_bound=3 * radius.max())
   depth = np.append(radius, 1.0)[near] - away  # none is near where the index is the tree's size
   soft = 0.35 * np.append(radius, 1.0)[near] + 0.8 / SIZE
@@ -180,7 +180,7 @@ def _tree(is_round: bool, leaves: int, way: float, random) -> tuple[np.ndarray, 
   else:
     net = random.uniform(0, 1, size=(1600, 2))
     root = random.randint(len(net))
-  away, near = KDTree(net).query(net, k=9)
+  away, near = scipy.spatial.KDTree(net).query(net, k=9)
   cost = away[:, 1:] * random.uniform(0.5, 1.5, (len(net), 8))
   row = np.repeat(np.arange(len(net)), 8)
   graph = csr_array((cost.ravel(), (row, np.asarray(near)[:, 1:].ravel())), shape=(len(net),) * 2)

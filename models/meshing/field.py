@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from scipy.ndimage import map_coordinates, zoom
+import scipy
 
 # Takes points (n, 3) and returns values (n,), negative inside and close to the distance.
 Implicit = Callable[[np.ndarray], np.ndarray]
@@ -30,7 +30,7 @@ class Field:
 
   def _between(self, array: np.ndarray, points: np.ndarray) -> np.ndarray:
     index = (points - self.origin).T / self.spacing
-    return np.asarray(map_coordinates(array, index, order=1, mode="nearest"))
+    return np.asarray(scipy.ndimage.map_coordinates(array, index, order=1, mode="nearest"))
 
   def surface(self, level: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Returns where the field has a level: vertices (n, 3), triangles (m, 3), winding outward."""
@@ -62,7 +62,7 @@ def tabulate(implicit: Implicit, bounds: np.ndarray, spacing: float) -> Field:
   coarse_count = (count - 1) // 4 + 1
   coarse_index = np.argwhere(np.ones(coarse_count))
   coarse = implicit(origin + coarse_index * (4 * spacing)).reshape(coarse_count)
-  value = np.asarray(zoom(coarse, count / coarse_count, order=1))
+  value = np.asarray(scipy.ndimage.zoom(coarse, count / coarse_count, order=1))
   near = np.argwhere(np.abs(value) < 5 * spacing)
   value[tuple(near.T)] = implicit(origin + near * spacing)
   return Field(value, origin, spacing)

@@ -6,10 +6,10 @@ tips, which have four. n x n is n^2 + 2 nodes.
 """
 
 import numpy as np
+import scipy
 from palpate.tissue.geometry.mesh import vertex_normals
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
-from scipy.spatial import KDTree
 
 from .quality import angles, normals
 from .remesh import Project, guard
@@ -216,7 +216,7 @@ def _carry(
   """Returns where points on the sphere lie on the surface that the sphere is a map of."""
   middle = sphere[triangles].mean(axis=1)
   middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-  _, near = KDTree(middle).query(points, k=min(16, len(triangles)))
+  _, near = scipy.spatial.KDTree(middle).query(points, k=min(16, len(triangles)))
   a, b, c = (sphere[triangles[:, i]][near] for i in range(3))
   share = np.stack(
     [np.einsum("nkd,nd->nk", np.cross(p, q), points) for p, q in ((b, c), (c, a), (a, b))], axis=2

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import binary_dilation
+import scipy
 
 from . import raster
 from .field import Field
@@ -160,4 +160,4 @@ def regions(only: np.ndarray, away: np.ndarray, reach: float) -> list[np.ndarray
 
 
 def _grow(mask: np.ndarray, within: np.ndarray, times: int) -> np.ndarray:
-  return np.asarray(binary_dilation(mask, iterations=times, mask=within))
+  return np.asarray(scipy.ndimage.binary_dilation(mask, iterations=times, mask=within))

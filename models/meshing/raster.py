@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, label
+import scipy
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -52,12 +52,12 @@ class Grid:
 
 def depth(mask: np.ndarray, spacing: float | np.ndarray = 1.0) -> np.ndarray:
   """Returns the distance of every true point of a grid to the nearest false one."""
-  return np.asarray(distance_transform_edt(mask, np.broadcast_to(spacing, 3)))
+  return np.asarray(scipy.ndimage.distance_transform_edt(mask, np.broadcast_to(spacing, 3)))
 
 
 def parts(mask: np.ndarray) -> tuple[np.ndarray, int]:
   """Returns the connected part, from 1, that every true point of a grid is in, and their count."""
-  return label(mask)  # pyright: ignore
+  return scipy.ndimage.label(mask)  # pyright: ignore
 
 
 def closed(triangles: np.ndarray) -> bool:

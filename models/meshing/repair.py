@@ -10,11 +10,10 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import scipy
 from palpate import meshes
-from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from .field import Field
 from .quality import normals
@@ -110,7 +109,7 @@ class Target:
     corner, corner_triangle = _thin_out(vertices[used], owner[used], spacing)
     self.points = np.concatenate([corner, inner])
     self.triangle = np.concatenate([corner_triangle, triangle])
-    self._tree = KDTree(self.points)
+    self._tree = scipy.spatial.KDTree(self.points)
 
   def distance(self, points: np.ndarray) -> np.ndarray:
     """Returns the distance to the nearest sample [m], (n,)."""
@@ -239,7 +238,7 @@ def solidify(target: Target, spacing: float, reach: float) -> Solid | None:
   label, _ = parts(distance > reach)
   air = label == label[0, 0, 0]
   rim = Field(np.where(air | (distance <= reach), distance, 0.0) - reach, origin, spacing)
-  tree = KDTree(rim.surface()[0])
+  tree = scipy.spatial.KDTree(rim.surface()[0])
   value = np.where(air, reach + spacing * depth(air), reach - spacing * depth(~air))
   near = np.argwhere(np.abs(value) < reach + 4 * spacing)
   away = tree.query(origin + near * spacing)[0]
@@ -250,7 +249,7 @@ def solidify(target: Target, spacing: float, reach: float) -> Solid | None:
   if not pieces:
     return None
   kept = np.bincount(label.ravel())[1:].argmax() + 1
-  away, nearest = distance_transform_edt(~inside, return_indices=True)  # pyright: ignore
+  away, nearest = scipy.ndimage.distance_transform_edt(~inside, return_indices=True)  # pyright: ignore
   covered = away[tuple(place.T)] <= 2.5
   own = label[tuple(nearest[(slice(None), *place.T)])] == kept
   value[inside & (label != kept)] = spacing

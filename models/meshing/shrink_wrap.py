@@ -6,9 +6,9 @@ import dataclasses
 import math
 
 import numpy as np
+import scipy
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from . import losses, raster
 from .field import Field
@@ -231,7 +231,7 @@ def _stretch(vertices: np.ndarray, triangles: np.ndarray, solid: Solid, flips: b
     if not len(far):
       break
     points, missed = points[far], missed[far]  # the other nodes hardly move
-    node = np.asarray(KDTree(vertices).query(points)[1])
+    node = np.asarray(scipy.spatial.KDTree(vertices).query(points)[1])
     order = np.argsort(missed, kind="stable")
     worst, goal = np.zeros(len(vertices)), vertices.copy()
     worst[node[order]], goal[node[order]] = missed[order], points[order]

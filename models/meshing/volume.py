@@ -12,7 +12,7 @@ import os
 import pathlib
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from . import images
 from .field import Field
@@ -190,11 +190,11 @@ def surface(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarra
     mask: which voxels                                        (i, j, k)
     affine: from indices (voxel centres) to metres            (4, 4)
   """
-  (box,) = ndimage.find_objects(mask.astype(np.int8))
+  (box,) = scipy.ndimage.find_objects(mask.astype(np.int8))
   mask, low = np.pad(mask[box], _PAD), np.array([each.start for each in box], dtype=float)
   edge = np.linalg.norm(affine[:3, :3], axis=0)
   distance = depth(~mask, edge) - depth(mask, edge)
-  distance = ndimage.gaussian_filter(distance, _SMOOTHING * edge.max() / edge)
+  distance = scipy.ndimage.gaussian_filter(distance, _SMOOTHING * edge.max() / edge)
   if distance.min() >= 0:
     raise ValueError(f"too small, {mask.sum()} voxels, expected an organ")
   vertices, triangles = Field(distance, low - _PAD, 1.0).surface()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from palpate.tissue.config import OWN
 from palpate.tissue.geometry import mesh as topology
-from scipy.spatial import KDTree
 
 from ..engine.host import Host
 from ..engine.model import flexes, inertia, mjstruct
@@ -74,7 +74,7 @@ def to_organ(
   vert = check_vertices(hosts[0], vertices)
   outer = np.flatnonzero(hosts[1].organ.free[: hosts[1].organ.mesh.nouter])
   mine, theirs = hosts[0].places(vert, now), hosts[1].places(outer, now)
-  pair = outer[KDTree(theirs).query(mine)[1]]
+  pair = outer[scipy.spatial.KDTree(theirs).query(mine)[1]]
   gap = mine - hosts[1].places(pair, now)
   each = _stiffness(hosts[0], vert, stiffness, np.inf)
   grips = [Grip(host.organ.mesh, held) for host, held in zip(hosts, (vert, pair), strict=True)]

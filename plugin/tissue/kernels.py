@@ -191,13 +191,14 @@ def _text(header: str, seen: set[str] | None = None) -> str:
   seen = seen or set()
   seen.add(header)
 
-  def included(line: re.Match) -> str:
-    return "" if line[1] in seen else _text(line[1], seen)
-
-  text = _read(header).replace("#pragma once\n", "")
-  return re.sub(r'^#include "([\w/]+\.h)"\n', included, text, flags=re.M)
+  return "".join(
+    part if i % 2 == 0 else "" if part in seen else _text(part, seen)
+    for i, part in enumerate(_parts(header))
+  )
 
 
 @functools.cache
-def _read(header: str) -> str:
-  return (NATIVE / header).read_text(encoding="utf-8")
+def _parts(header: str) -> list[str]:
+  """Returns a header's text where every second entry is the name of a header to include there."""
+  text = (NATIVE / header).read_text(encoding="utf-8").replace("#pragma once\n", "")
+  return re.split(r'^#include "([\w/]+\.h)"\n', text, flags=re.M)

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from . import tets
 from .config import Config
@@ -55,7 +55,7 @@ def young(mesh: Mesh, config: Config) -> np.ndarray:
 def nearest_triangle(mesh: Mesh) -> np.ndarray:
   """Returns the triangle nearest to each tetrahedron before the first cut, (ntet,)."""
   mesh = mesh.whole
-  middle = KDTree(mesh.rest[mesh.elem].mean(axis=1))
+  middle = scipy.spatial.KDTree(mesh.rest[mesh.elem].mean(axis=1))
   return np.asarray(middle.query(mesh.rest[mesh.tet].mean(axis=1))[1])
 
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import mujoco as mj
 import numpy as np
+import scipy
 from palpate import Organ, Thread
 from palpate.models import laparoscope
 from palpate.tissue.config import Config
 from palpate.tissue.geometry import mesh as topology
-from scipy.spatial import cKDTree
 
 from ..learn.portable import Portable
 from ..metrics.samples import Stretch
@@ -254,7 +254,7 @@ class Physics(Instrument, Portable):
     facing = -(self.normals() @ shaft)
     free = organ.free[organ.elem].all(axis=1)
     if not organ.free.all():
-      pins = cKDTree(x[~organ.free])
+      pins = scipy.spatial.KDTree(x[~organ.free])
       free &= pins.query(middle)[0] > _PIN_GAP
     reach = np.linalg.norm(offset, axis=1)
     low, high = port.ranges[2] + port.depth + np.array([0.01, -0.015])

@@ -18,9 +18,9 @@ import math
 from typing import Annotated, Any
 
 import numpy as np
+import scipy
 import warp as wp
 from palpate.tissue.types import Array, floats, ints
-from scipy.spatial import cKDTree
 
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
@@ -174,7 +174,7 @@ def _project(s, o):
 
 def aside(s, o):
   """Returns how far the tip is from the nearest point of the curve [m]."""
-  return float(cKDTree(o.now).query(tip(s))[0])
+  return float(scipy.spatial.KDTree(o.now).query(tip(s))[0])
 
 
 @many(aside)

@@ -8,8 +8,8 @@ from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.spatial.distance import cdist
 
 from .definition import UnknownError, metric
 from .samples import rows, same
@@ -213,7 +213,8 @@ def trace_frechet(traced_pos: ArrayLike, curve: ArrayLike) -> float:
   fine = np.union1d(at, np.linspace(0, at[-1], 257))
   if len(fine) < 2:
     raise UnknownError("the curve has no length")
-  distance = cdist(pos, np.stack([np.interp(fine, at, column) for column in curve.T], axis=1))
+  path = np.stack([np.interp(fine, at, column) for column in curve.T], axis=1)
+  distance = scipy.spatial.distance.cdist(pos, path)
   n, m = distance.shape
   flat = distance.ravel()
   # Anti-diagonals i + j = k do not depend on themselves; entry i + 1 belongs to row i.

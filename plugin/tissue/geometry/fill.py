@@ -19,10 +19,10 @@ import tempfile
 import zipfile
 
 import numpy as np
+import scipy
 import warp as wp
 from scipy import sparse
 from scipy.sparse import csgraph, linalg
-from scipy.spatial import ConvexHull, KDTree
 
 from .mesh import Mesh, area_vectors, vertex_normals
 
@@ -213,7 +213,8 @@ def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
   low, high = surface.min(axis=0), surface.max(axis=0)
   graded = widest > _GRADED * edge
   coarser = _FINE if graded else _COARSER
-  tree, side = KDTree(surface), coarser * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
+  tree = scipy.spatial.KDTree(surface)
+  side = coarser * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
   ends = np.array([local.min(), 2.83 * _WIDEST * widest]) / edge
   levels = range(*np.rint(np.log2(ends)).astype(int))
   while True:
@@ -296,7 +297,7 @@ def _joined(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   """
   at = (point - point.mean(axis=0)) / np.ptp(point, axis=0).max()
   height = (at**2).sum(axis=1) + _TIE * np.random.RandomState(0).uniform(-1, 1, len(at))
-  hull = ConvexHull(np.column_stack([at, height]))
+  hull = scipy.spatial.ConvexHull(np.column_stack([at, height]))
   low = hull.equations[:, 3] < 0
   number = np.append(np.where(low, np.cumsum(low) - 1, -1), -1)
   return hull.simplices[low].astype(np.int64), number[hull.neighbors[low]]

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from . import fill
 from .mesh import Mesh
@@ -103,7 +103,7 @@ def _fitted(where: str, mesh: Mesh, point: np.ndarray, tet: np.ndarray) -> Mesh:
   if not np.isfinite(point).all():
     raise ValueError(f"{where}, which has nodes that are not finite")
   size = float(np.ptp(mesh.rest, axis=0).max())
-  far, node = KDTree(point).query(mesh.rest)
+  far, node = scipy.spatial.KDTree(point).query(mesh.rest)
   worst = int(np.argmax(far))
   if far[worst] > _CLOSE * size:
     raise ValueError(

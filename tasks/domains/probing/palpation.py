@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import numpy as np
+import scipy
 from palpate.models import shapes
 from palpate.tissue.types import ints
-from scipy.spatial import cKDTree
 
 from ...core import scenes
 from ...core.base import Physics, Task
@@ -195,9 +195,9 @@ class Palpate(Task):
     area = np.linalg.norm(normal, axis=1)
     port = np.asarray(scene.port) / np.linalg.norm(scene.port)
     middle = corners.mean(axis=1)
-    pins = cKDTree(vertices[list(scenes.pins(scene.organ, scene.nodes, scene.variant))])
+    pins = list(scenes.pins(scene.organ, scene.nodes, scene.variant))
     near = np.linalg.norm(middle - center, axis=1) < self.spread
-    near &= pins.query(middle)[0] > _PIN_GAP
+    near &= scipy.spatial.KDTree(vertices[pins]).query(middle)[0] > _PIN_GAP
     field = np.flatnonzero(near & (normal @ port > _FACING * area))
     outward, share = normal[field] / area[field, None], area[field] / area[field].sum()
     beside = feeling.sides(middle[field], np.asarray(scene.port, float))

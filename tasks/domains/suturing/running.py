@@ -34,10 +34,10 @@ from typing import Annotated, Any
 import mujoco
 import numpy as np
 import palpate
+import scipy
 import warp as wp
 from palpate.models import trocar, wrist
 from palpate.tissue.types import Array, floats, ints
-from scipy import optimize
 
 from ...core.base import Physics
 from ...core.performer import Performer, Script
@@ -520,7 +520,7 @@ def _laid(holes: np.ndarray, swage: np.ndarray) -> np.ndarray:
   def left(angle: float) -> float:
     return over - _along(_bow(swage, seam[-1], angle))
 
-  found = optimize.root_scalar(left, bracket=(0.1, math.pi - 0.1))
+  found = scipy.optimize.root_scalar(left, bracket=(0.1, math.pi - 0.1))
   return np.concatenate([_bow(swage, seam[-1], found.root), seam[-2::-1]])
 
 
