@@ -72,9 +72,7 @@ def main(args: argparse.Namespace) -> int:
   with Interrupt() as interrupt:
 
     def simulate(values):
-      if interrupt.seen:
-        raise least_squares.Stopped
-      return simulation.force(start | values)
+      return simulation.force(start | values, interrupt)
 
     def tell(values, error, count):
       found = ", ".join(f"{name} {value:.4g}" for name, value in values.items())

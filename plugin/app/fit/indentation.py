@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mujoco
@@ -17,6 +17,7 @@ from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology
 
 from ..console import CommandError
+from .least_squares import Stopped
 from .measured import Record
 
 _STEPS = 600  # of a record, unless the time step is given
@@ -125,8 +126,14 @@ class Indentation:
     """The tissue's configuration before any constant is changed."""
     return self.sample.keys
 
-  def force(self, constants: Mapping[str, float]) -> np.ndarray:
-    """Returns the tissue's push on the tool at the record's times [N], (n,)."""
+  def force(
+    self, constants: Mapping[str, float], is_stopped: Callable[[], bool] = lambda: False
+  ) -> np.ndarray:
+    """Returns the tissue's push on the tool at the record's times [N], (n,).
+
+    Raises:
+      Stopped: `is_stopped`, asked before each step, said so
+    """
     try:
       # Compiled anew, since what contacts meet follows from stiffness and damping.
       model = self._scene(constants).compile()
@@ -140,6 +147,8 @@ class Indentation:
     depth = self._test.share * np.interp(time, record.time, record.depth)
     force, sunk = np.zeros(len(time) - 1), 0.0
     for k in range(len(force)):
+      if is_stopped():
+        raise Stopped
       data.qpos[qpos] = depth[k] + sunk
       data.qvel[dof] = (depth[k + 1] - depth[k]) / h
       mujoco.mj_step(model, data)
