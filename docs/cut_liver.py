@@ -5,12 +5,10 @@ python docs/cut_liver.py
 
 import pathlib
 
-import palpate  # before MuJoCo is imported: it chooses how to draw
-
-# isort: split
 import imageio.v3 as imageio
 import mujoco
 import numpy as np
+import palpate
 from palpate import models
 from palpate.models import organs, scenery, situs
 from palpate.tissue.geometry.mesh import area_vectors

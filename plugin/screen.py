@@ -28,14 +28,15 @@ def has_display() -> bool:
 def prepare_gl() -> None:
   """Imports MuJoCo so that it draws without a screen where there is none.
 
-  Without a screen MUJOCO_GL is set, unless it is, to what draws. Where MuJoCo was imported before,
-  it has read the variable and loaded what it says.
+  Without a screen MUJOCO_GL is set, unless it is, to what draws, and MuJoCo draws so even where it
+  was imported before. Where the variable was set, MuJoCo has then loaded what it says.
   """
+  chosen = None
   if "MUJOCO_GL" not in os.environ and not has_display():
-    for name, library in _LIBRARIES.items():
-      if "MUJOCO_GL" not in os.environ and ctypes.util.find_library(library):
-        os.environ["MUJOCO_GL"] = name
-  if "mujoco" in sys.modules:
+    chosen = next((name for name, lib in _LIBRARIES.items() if ctypes.util.find_library(lib)), None)
+    if chosen:
+      os.environ["MUJOCO_GL"] = chosen
+  if "mujoco" in sys.modules and not chosen:
     return
   with _put_off() as backend:
     names = "mujoco", "mujoco.rendering.classic.gl_context"
@@ -61,7 +62,6 @@ def import_dm_control() -> bool:
     _drop_removed_sizes()
   if backend:
     render.BACKEND, render.USING_GPU = backend, backend == "egl"
-    del render.Renderer
     _bring(render, "Renderer", getattr(render, f"_import_{backend}"))
   return True
 
@@ -103,4 +103,5 @@ def _bring(module: ModuleType, name: str, load: Callable[[], Any]) -> None:
     setattr(module, name, load())
     return getattr(module, name)
 
+  vars(module).pop(name, None)
   setattr(module, "__getattr__", find)  # noqa: B010, a module has none to assign to

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-import palpate  # noqa: F401 - before MuJoCo is imported: it chooses how to draw
+import palpate  # noqa: F401 - it chooses how to draw
 import pytest
 import scenes as builders
 from devices import needs_cuda

@@ -96,13 +96,14 @@ print("stepped")
   assert "Exception" not in done.stderr and "Error" not in done.stderr
 
 
-def test_drawing_without_a_screen_and_without_being_told_how(monkeypatch):
+@pytest.mark.parametrize("order", ["palpate, mujoco", "mujoco, palpate"])
+def test_drawing_without_a_screen_and_without_being_told_how(order, monkeypatch):
   for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY"):
     monkeypatch.delenv(name, raising=False)
   if not (ctypes.util.find_library("EGL") or ctypes.util.find_library("OSMesa")):
     pytest.skip("no way to draw without a screen")
   code = f"""
-import palpate, mujoco
+import {order}
 model = mujoco.MjModel.from_xml_path({str(SCENE)!r})
 data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)
