@@ -1,7 +1,5 @@
 """The MJCF of organs and of the catalogue's scenes."""
 
-from __future__ import annotations
-
 import pathlib
 import textwrap
 from collections.abc import Mapping, Sequence

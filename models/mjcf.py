@@ -3,8 +3,6 @@
 Everything returns text. It does not end in a newline, except for a file's.
 """
 
-from __future__ import annotations
-
 import pathlib
 import textwrap
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@
 World of the scenes: the patient lies on the back, x to the right, -y superior, z anterior; metres.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -5,8 +5,6 @@ it. World: that of the catalogue's scenes, the liver's frame turned so that ante
 superior is -y.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Iterator, Mapping, Sequence

@@ -6,8 +6,6 @@ A texture is a factor on a material's colour. That of an organ lies on half a sp
 halves of the organ show: there is no seam, because the halves meet where they are the same.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools

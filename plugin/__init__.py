@@ -4,8 +4,6 @@
 MJCF is then a deformable organ in `mujoco.mj_step` and everything that is built on it.
 """
 
-from __future__ import annotations
-
 import importlib as _importlib
 import os as _os
 import sys as _sys

@@ -1,7 +1,5 @@
 """Attributes as MJCF has them, for specs and for texts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

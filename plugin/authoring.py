@@ -1,7 +1,5 @@
 """Writing scenes: adds an organ to an `mujoco.MjSpec`, as a <flexcomp> does to MJCF."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import mujoco

@@ -1,7 +1,5 @@
 """`Bonds`: what an organ has grown on to, and how much of it is free."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 from palpate.engine.layout import BOND

@@ -1,7 +1,5 @@
 """Surfaces from files and from what others make of them, in metres."""
 
-from __future__ import annotations
-
 import math
 import os
 

@@ -1,7 +1,5 @@
 """Surgical needles: `add_needle` adds a curved one to an `mujoco.MjSpec`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import mujoco

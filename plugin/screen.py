@@ -4,8 +4,6 @@ OpenGL is loaded when a picture is asked for, not before: Mesa brings an LLVM th
 where torch brings another one later. MuJoCo and dm_control load it as they are imported.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes.util
 import importlib

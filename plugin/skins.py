@@ -1,7 +1,5 @@
 """Smooth organs in pictures: gives an organ of an `mujoco.MjSpec` a skin."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from palpate.engine.model.skin import HIDDEN

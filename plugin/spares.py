@@ -1,7 +1,5 @@
 """Writing scenes: gives an organ of an `mujoco.MjSpec` room for cuts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

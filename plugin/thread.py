@@ -1,7 +1,5 @@
 """Surgical threads: `add_thread` adds one to an `mujoco.MjSpec`, `Thread` is the handle on it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import mujoco

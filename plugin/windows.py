@@ -1,7 +1,5 @@
 """Writing scenes: gives an organ of an `mujoco.MjSpec` windows, so that nobody does it by hand."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import warnings

@@ -1,7 +1,5 @@
 """Writes wrapped surfaces as a model folder: meshes, organs, scene and report."""
 
-from __future__ import annotations
-
 import os
 import pathlib
 import textwrap

@@ -5,8 +5,6 @@ map (4, 4) from indices to metres, x to the patient's right, y anterior, z super
 segments that have names.
 """
 
-from __future__ import annotations
-
 import bz2
 import dataclasses
 import gzip

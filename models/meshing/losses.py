@@ -1,7 +1,5 @@
 """What a wrap leaves out of the mesh it was made from, and what it fills, each with its volume."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """A mesh of so many nodes around a body: found, meshed, and drawn onto the body's surface."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

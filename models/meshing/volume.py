@@ -4,8 +4,6 @@ Frame: x to the patient's right, y anterior, z superior (RAS), metres, whatever 
 slices and orientation; the origin is the image's.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os

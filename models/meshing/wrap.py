@@ -8,8 +8,6 @@ is first made into a shape with an inside (see repair.py), then meshed by one of
 - `direct`: the mesh as it is, if it is good already.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 

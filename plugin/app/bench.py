@@ -1,7 +1,5 @@
 """`palpate bench NAME`: runs a measurement of `tests/benchmarks`, in a checkout alone."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import pathlib

@@ -8,8 +8,6 @@ Exit codes: 0 done; 1 it did not work; 2 a wrong option or scene; 130 interrupte
 the output has closed it.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import os

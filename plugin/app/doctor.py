@@ -1,7 +1,5 @@
 """`palpate doctor`: what is installed, what works, and what is wrong, one line each."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib.metadata

@@ -1,7 +1,5 @@
 """`palpate exercise`: runs one exercise, records it and writes its report."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import dataclasses

@@ -1,7 +1,5 @@
 """An exercise by the keyboard, in MuJoCo's window and in real time."""
 
-from __future__ import annotations
-
 import pathlib
 import time
 from collections.abc import Callable, Mapping

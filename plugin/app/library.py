@@ -3,8 +3,6 @@
 The program calls what `import palpate` registers, so MJCF and results are the same to the bit.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import pathlib

@@ -1,7 +1,5 @@
 """Options of an exercise on the command line: `--set time_limit=5 --set 'pixels=[84,84]'`."""
 
-from __future__ import annotations
-
 import argparse
 import functools
 import inspect

@@ -5,8 +5,6 @@ go on at will. The folder is named after what decides an episode (sources, model
 that nothing an older version left is mixed in.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import hashlib

@@ -1,7 +1,5 @@
 """`palpate serve`: a page to train on."""
 
-from __future__ import annotations
-
 import argparse
 import pathlib
 import threading

@@ -1,7 +1,5 @@
 """`palpate warmup`: compiles and loads everything ahead, so that no first run has to wait."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import time

@@ -3,8 +3,6 @@
 A worker has one job at a time, so one that dies takes one job with it. Jobs are done in any order.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import dataclasses

@@ -1,7 +1,5 @@
 """`palpate wrap`: a mesh or a segmented volume becomes an organ, in a model folder of its own."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import pathlib

@@ -9,8 +9,6 @@
 The same code runs with `device="cpu"`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import mujoco

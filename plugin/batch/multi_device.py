@@ -4,8 +4,6 @@ Each device has a batch of its own, in `parts`, and steps beside the others. Wha
 worlds is gathered on the first device; `parts` have theirs in place.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ its step, mujoco_warp takes one with the windows' contacts and the force that br
 along (`coupling/node.h`), and the nodes take over what contacts made of the slots.
 """
 
-from __future__ import annotations
-
 import functools
 import warnings
 from typing import Any

@@ -1,7 +1,5 @@
 """What cameras look at: worlds with bodies and organs. A batch is one, an mjData another."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 

@@ -6,8 +6,6 @@ with it; sites, and what one can look through, are surfaces of their own, of whi
 change place, size and colour. Organs are in `soft`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 

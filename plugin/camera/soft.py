@@ -5,8 +5,6 @@ the triangles, the organ's own surface is drawn, a flex's radius outside, as MuJ
 sheet has two sides, and so has a closed one that can be cut open.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import Any

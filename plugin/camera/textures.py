@@ -1,7 +1,5 @@
 """Textures of a model in one array, each with pictures half as large, a quarter, ... of it."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

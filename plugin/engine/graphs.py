@@ -5,8 +5,6 @@ thread launches meanwhile would become part of the recording, or end the process
 has a place of its own, as in Warp's native half.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import os

@@ -4,8 +4,6 @@ MuJoCo calls through ctypes, which drops exceptions, so every callback catches a
 model is compiled they become its error message, while it runs a MuJoCo warning and `Organ.error`.
 """
 
-from __future__ import annotations
-
 import atexit
 import ctypes as C
 import functools

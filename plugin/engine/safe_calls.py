@@ -3,8 +3,6 @@
 A MuJoCo error jumps to where its step was called, over Python's frames if there are any between.
 """
 
-from __future__ import annotations
-
 import _thread
 from collections.abc import Callable
 from typing import Any

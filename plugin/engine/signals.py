@@ -4,8 +4,6 @@ MuJoCo calls the plugin through ctypes, which drops exceptions; and a thread tha
 callback takes the process with it.
 """
 
-from __future__ import annotations
-
 import _thread
 import atexit
 import contextlib

@@ -1,7 +1,5 @@
 """What an organ is attached to, by its declaration or from Python, and how firmly."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import scipy

@@ -1,7 +1,5 @@
 """What needles and their threads are, by their bodies in a model, and where they go through."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The table of passive forces, which both hosts read."""
 
-from __future__ import annotations
-
 from .attachments import Attachments
 from .cohesive_bonds import Bonds
 from .cutters import Cutters

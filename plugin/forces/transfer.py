@@ -4,8 +4,6 @@ A vertex is the corner of some triangles, and these keep their numbers: what bec
 these corners are now. So it follows from the mesh alone, whichever way that came to be.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -6,8 +6,6 @@ ring around it is divided into triangles anew, and its displacement is interpola
 in them. Vertices that stay do not move, so a coarse mesh follows the deformed one by sampling it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

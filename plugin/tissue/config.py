@@ -1,7 +1,5 @@
 """The organ's configuration: one row a `<config>` key says what it means and what it may hold."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

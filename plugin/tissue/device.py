@@ -5,8 +5,6 @@ machine without an NVIDIA driver is an ordinary place to run, but Warp's library
 error whatever the log level is. `palpate doctor` lists the devices.
 """
 
-from __future__ import annotations
-
 import ctypes
 import dataclasses
 import functools

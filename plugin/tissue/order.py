@@ -1,7 +1,5 @@
 """Where the nodes lie in memory: their order, slices of eight, offsets, irregular lists."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph

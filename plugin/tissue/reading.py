@@ -1,7 +1,5 @@
 """How the words of a configuration key are read, and what a message says is allowed."""
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """What a thread's configuration and shape make of its stiffness; see `native/tissue/rod.h`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from .config import Config

@@ -1,7 +1,5 @@
 """Makes a body: mesh and configuration to sliced arrays on a device."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

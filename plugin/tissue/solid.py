@@ -1,7 +1,5 @@
 """The inside of a solid: tetrahedra, and means over nodes of their gradients, to sliced arrays."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

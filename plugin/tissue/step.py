@@ -25,8 +25,6 @@ its first-order Neumann polynomial about D = diag W,
     dv = (2 D^-1 - D^-1 W D^-1) (h (F + f_ext) + (h^2 + h damping) H v) / m.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable

@@ -7,8 +7,6 @@ Threads that are sold bear about twice as much: Naleway et al. 2015 (doi:10.1002
 measured 18.9 N of knotted polypropylene of size 3-0.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 

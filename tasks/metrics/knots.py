@@ -4,8 +4,6 @@ A throw of k turns, with the thread's ends joined far away, is the torus knot T(
 or left-handed. Throws one after the other are their connected sum, with the product of polynomials.
 """
 
-from __future__ import annotations
-
 import collections
 import functools
 import itertools

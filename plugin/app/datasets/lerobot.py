@@ -7,8 +7,6 @@ besides, `next.*` what came of the action. Seeds and outcomes of the episodes ar
 `meta/palpate.json`.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import pathlib

@@ -1,7 +1,5 @@
 """Minari's HDF5, written by Minari itself."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import pathlib
 from collections.abc import Iterable

@@ -4,8 +4,6 @@ The layout is that of robomimic 0.5, docs/datasets/overview.md: `data/demo_0` wi
 `next_obs`, `actions`, `rewards`, `dones`; pictures are lossless (height, width, channel) bytes.
 """
 
-from __future__ import annotations
-
 import json
 import pathlib
 import zlib

@@ -1,7 +1,5 @@
 """`palpate render`: a picture or a film of a scene, without a screen."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Iterator

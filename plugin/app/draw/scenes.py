@@ -1,7 +1,5 @@
 """What `palpate view` and `palpate render` share: the scene that is asked for."""
 
-from __future__ import annotations
-
 import argparse
 import pathlib
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`palpate view`: MuJoCo's viewer on a scene, the instruments' handles draggable."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from typing import Any

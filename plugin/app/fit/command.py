@@ -1,7 +1,5 @@
 """`palpate fit`: constants of tissue from a measured indentation or grasp."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

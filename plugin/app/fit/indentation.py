@@ -1,7 +1,5 @@
 """The same test as a measured one, simulated: a tool, or two, go the way that was measured."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Mapping

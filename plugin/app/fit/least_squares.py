@@ -1,7 +1,5 @@
 """Least squares for constants of tissue, with confidence intervals."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -1,7 +1,5 @@
 """A table of an indentation that was measured: time, depth and force, with their units."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import math

@@ -5,8 +5,6 @@ not run again with --resume. When all are there the data set is made of them and
 FOLDER; nothing of that name is ever half a data set.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import hashlib

@@ -1,7 +1,5 @@
 """The coach: says what to do next and what goes wrong, and afterwards what to do better."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping

@@ -9,8 +9,6 @@ are in the model, see `models.handle`.
 In a loop of 1 kHz all of this costs a few microseconds: plain numbers, no arrays.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import threading

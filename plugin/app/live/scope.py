@@ -6,8 +6,6 @@ hand says by `jaw`. The script that follows keeps the tip in the middle, slowly,
 has strayed from there.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`palpate run press`: a probe presses an organ; a table, a CSV, a plot and a film of it."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import dataclasses

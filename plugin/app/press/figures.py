@@ -1,7 +1,5 @@
 """Pictures of a press: force and displacement over time, and a film of it."""
 
-from __future__ import annotations
-
 import pathlib
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """A probe pressing an organ: the scene's actuator, the path it follows, and what is measured."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`palpate trainee add`: adds people to a record."""
 
-from __future__ import annotations
-
 import argparse
 
 from . import keeping

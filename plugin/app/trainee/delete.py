@@ -1,7 +1,5 @@
 """`palpate trainee delete`: deletes all of a person's data."""
 
-from __future__ import annotations
-
 import argparse
 
 from ..console import CommandError

@@ -1,7 +1,5 @@
 """`palpate trainee limits`: makes proficiency limits of experts' recordings."""
 
-from __future__ import annotations
-
 import argparse
 import pathlib
 import sys

@@ -1,7 +1,5 @@
 """`palpate trainee list`: who is in a record, and what they have done."""
 
-from __future__ import annotations
-
 import argparse
 
 from . import history, keeping

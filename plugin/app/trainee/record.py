@@ -8,8 +8,6 @@ reads no samples. No name stands in a path or in a recording. Folders that this 
 owner's alone (0700), and so is every file (0600).
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import datetime

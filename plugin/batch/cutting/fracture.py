@@ -1,7 +1,5 @@
 """What comes apart of an organ in the worlds of a batch, on any device."""
 
-from __future__ import annotations
-
 import abc
 from typing import Any
 

@@ -3,8 +3,6 @@
 Launched one after the other, each is compiled as it is met: minutes on a GPU's first step.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """What flexes of a compiled mjModel are: names, vertices, triangles, places, and what they meet."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 

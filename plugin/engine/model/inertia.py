@@ -1,7 +1,5 @@
 """Effective inertia: the mass that a contact meets at a node; MuJoCo gets it as joint armature."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

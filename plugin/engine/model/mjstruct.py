@@ -4,8 +4,6 @@ MuJoCo's own introspection data gives the declarations, so that no layout is wri
 `check` compares the result with the addresses the bindings report, once, before anything is run.
 """
 
-from __future__ import annotations
-
 import ctypes as C
 import functools
 import importlib.metadata

@@ -4,8 +4,6 @@ MuJoCo calls the plugin while it compiles, so that plain MJCF needs no helper: w
 stays in the model, and in its copies and files.
 """
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

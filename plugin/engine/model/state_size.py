@@ -1,7 +1,5 @@
 """How long an organ's part of mjData.plugin_state is, before MuJoCo has filled in the flexes."""
 
-from __future__ import annotations
-
 from palpate.tissue.geometry import fill
 
 from .. import coupling, layout

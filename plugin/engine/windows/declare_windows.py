@@ -1,7 +1,5 @@
 """Reads the declaration of an organ with windows from a compiled mjModel and checks it."""
 
-from __future__ import annotations
-
 import numpy as np
 from palpate.tissue import device as devices
 from palpate.tissue.config import Config

@@ -10,8 +10,6 @@ contacts without it, before the callback in which the mark is read: where anothe
 windows meanwhile, the mark has changed.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import threading

@@ -9,8 +9,6 @@ contacts and the user's program decides what to do. It takes for granted that wh
 organ besides contacts stays; where that was wrong the solve is done again.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Where on a path behind a blade a sheet comes apart next."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

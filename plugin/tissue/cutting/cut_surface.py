@@ -1,7 +1,5 @@
 """The surface along which a solid is cut: lines from a path on its skin inward, side by side."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -4,8 +4,6 @@ Two kinds behind one interface: how a path becomes a cut, how a body's arrays fo
 plugin state has it. What is above, in one world or many, does not ask which kind it is.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any

@@ -6,8 +6,6 @@ on the host, by what writes a cut into a body, and go to the device as they are.
 mesh is of other tissue has a row from the first, and a copy of that to come back to.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

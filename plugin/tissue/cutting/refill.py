@@ -4,8 +4,6 @@ Numbers of triangles, tetrahedra, hinges, edges and nodes stay, and rows have ro
 only what is near the cut is written anew, as it was written first.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import warp as wp
 

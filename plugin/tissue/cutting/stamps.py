@@ -1,7 +1,5 @@
 """Triangles as one number each, and stamps that tell meshes apart, in numbers that a double has."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

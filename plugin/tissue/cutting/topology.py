@@ -4,8 +4,6 @@ The plugin's world and every world of a batch use this text, for sheets and for 
 knows which of the two an organ is.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any

@@ -6,8 +6,6 @@ a sphere, vertices of four neighbours give way until at most (1 - nu) / (1 + nu)
 stiffness is left. The same points with parallel diagonals have six neighbours each and are exact.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph

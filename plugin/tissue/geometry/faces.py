@@ -6,8 +6,6 @@ hang together by faces. Those of the skin come first, those inside last; what co
 surface takes the numbers between, of spare vertices, and its old ones are used no more.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -8,8 +8,6 @@ other diagonal: these serve as well. Where it has neither, there is an error. In
 `refine` makes them, flat tetrahedra lie between the two triangulations and are left out.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

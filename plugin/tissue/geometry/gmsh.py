@@ -1,7 +1,5 @@
 """Tetrahedra of an organ from a Gmsh file, in place of those that `fill` makes."""
 
-from __future__ import annotations
-
 import itertools
 import os
 from collections.abc import Iterator

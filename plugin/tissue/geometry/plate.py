@@ -3,8 +3,6 @@
 In float64, for energies; what kernels use is `tissue/plate.h`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -6,8 +6,6 @@ control mesh that is chosen so that the limit goes through the coarse vertices. 
 fine vertex add up to 1: a linear map of the coarse vertices is the same map of the fine ones.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

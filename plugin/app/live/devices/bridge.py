@@ -3,8 +3,6 @@
 The packets are in docs/live.md.
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import struct

@@ -3,8 +3,6 @@
 Axes of a device: x to the right, y up, z towards the person, as the laparoscope's picture has them.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import Any, NamedTuple, Protocol
 

@@ -1,7 +1,5 @@
 """A simulated hand: a mass with damping that wants to be somewhere and feels forces."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from .device import STILL, DeviceError, Four, Reading, Silent, Three

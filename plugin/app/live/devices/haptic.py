@@ -4,8 +4,6 @@ They were written after the packages' own interfaces and tried without hardware.
 thread of its own, and lets go by itself when the loop says nothing for 50 ms.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 import threading

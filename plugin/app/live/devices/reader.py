@@ -1,7 +1,5 @@
 """Reads a device that may vanish, fall silent, or say what no hand does."""
 
-from __future__ import annotations
-
 import math
 
 from .device import Device, DeviceError, Reading

@@ -1,7 +1,5 @@
 """Devices that know movements and speeds but no place: mouse, keyboard, gamepad, SpaceMouse."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Iterable, Sequence

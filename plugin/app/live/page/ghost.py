@@ -4,8 +4,6 @@ In a process of its own, for it takes seconds; the result is JSON: times [s], an
 orientation of the tip at each of them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """What a page may ask for: the choices it is offered, and the check of what it sends."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from palpate.tissue import step

@@ -1,7 +1,5 @@
 """The page: who may load it, and one process for each that is open."""
 
-from __future__ import annotations
-
 import contextlib
 import ipaddress
 import json

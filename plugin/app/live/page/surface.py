@@ -2,8 +2,6 @@
 # pyright: reportAttributeAccessIssue=false
 """What a page draws of an organ: its triangles, the finer surface over them, and its look."""
 
-from __future__ import annotations
-
 import base64
 import functools
 from collections.abc import Sequence

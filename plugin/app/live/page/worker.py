@@ -3,8 +3,6 @@
 Messages to here are JSON; from here JSON (`T` before it) or frames of a picture (`B`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import pathlib
