@@ -1,6 +1,5 @@
 """What needles do in the worlds of a batch."""
 
-# pyright: reportInvalidTypeForm=false
 from collections.abc import Sequence
 
 import numpy as np
@@ -36,7 +35,6 @@ class ToldNeedles:
 
 class Needles(tuple_of(ToldNeedles)):
   """The arrays of `ToldNeedles`."""
-
 
 _OF_HOLES = [name for name in ToldNeedles.vars if name.startswith("hole_")]
 _OF_NEEDLES = ("touches", "inside", "force", "tip_force", "energy")

@@ -5,7 +5,6 @@ constraints and its solver the thread takes its step (`coupling/world_rods.h`), 
 organ through which it goes.
 """
 
-# pyright: reportInvalidTypeForm=false
 import functools
 from typing import TYPE_CHECKING, Any
 

@@ -4,8 +4,6 @@ MuJoCo 3.17 weighs the corners of a touched triangle by inverse distance: forces
 flicker where a tool presses. MuJoCo 4.0 has it right. Both part what slides.
 """
 
-# pyright: reportInvalidTypeForm=false
-
 import functools
 from typing import TYPE_CHECKING
 

@@ -8,7 +8,6 @@ the forces that act in it, and gains no more energy than they give. The inertia 
 then is a guess of what a tool meets, and follows the organ's answers.
 """
 
-# pyright: reportInvalidTypeForm=false
 import ctypes
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -128,7 +127,6 @@ class Phases:
 
   def look_ahead(self):
     """Looks at the solution that was begun so, on `side`."""
-
 
 def memory(*names: str) -> Callable[[type], Any]:
   """Returns a decorator: a struct has MuJoCo's own memory under its own names as well.

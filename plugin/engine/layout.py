@@ -5,7 +5,6 @@ views of them. Short ones (`Numbers`) have a name for each number. Native code h
 fields and the offsets of the short ones as constants, HEAD_MODE for `HEAD.mode`.
 """
 
-# pyright: reportInvalidTypeForm=false
 import math
 from collections.abc import Mapping
 from typing import Any

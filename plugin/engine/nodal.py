@@ -1,6 +1,5 @@
 """Nodal coupling: an organ whose moving nodes are MuJoCo's degrees of freedom."""
 
-# pyright: reportInvalidTypeForm=false
 from typing import TYPE_CHECKING
 
 import numpy as np

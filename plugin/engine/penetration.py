@@ -4,8 +4,6 @@ MuJoCo looks for contacts once a step, on a surface without thickness: what pass
 radius in a step, or is pressed through, comes out inside.
 """
 
-# pyright: reportInvalidTypeForm=false
-
 from typing import TYPE_CHECKING
 
 import mujoco

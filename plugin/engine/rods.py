@@ -4,7 +4,6 @@ A flex of dim 1 with `elements="rod"` is a thread. It has a step (`solver/rod_st
 coupling (`coupling/rod.h`) of its own, in doubles on the CPU.
 """
 
-# pyright: reportInvalidTypeForm=false
 import dataclasses
 import functools
 import zlib

@@ -5,7 +5,6 @@ grasp, and what lies on a foundation that is carried. The organ's step has them 
 the bodies feel what they have pulled; see `forces/attachments.h`.
 """
 
-# pyright: reportInvalidTypeForm=false
 import dataclasses
 from typing import Any, NamedTuple, Optional
 

@@ -3,7 +3,6 @@
 The kernels are in `forces/cohesive_bonds.h`; what is bonded to what is found in `declare_bonds`.
 """
 
-# pyright: reportInvalidTypeForm=false
 import dataclasses
 from typing import Any, Optional
 

@@ -4,7 +4,6 @@ A blade's path grows step by step, in the plugin state or what a batch keeps of 
 come apart along it, a few edges at a time, since they cannot do so by less.
 """
 
-# pyright: reportInvalidTypeForm=false
 import dataclasses
 from typing import Any
 

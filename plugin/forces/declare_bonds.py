@@ -1,6 +1,5 @@
 """What an organ is bonded to, by its declaration or from Python; see `cohesive_bonds`."""
 
-# pyright: reportInvalidTypeForm=false
 from typing import Any
 
 import numpy as np

@@ -6,7 +6,6 @@ whose arrays have worlds in front: a kernel begins by moving what worlds have of
 world.
 """
 
-# pyright: reportInvalidTypeForm=false
 import abc
 import contextlib
 import functools
@@ -39,7 +38,6 @@ numbers = doubles("nnumber")  # of a tissue, see `NUMBERS`; in a batch a row a w
 )
 class Bodies:
   """What forces read and write of MuJoCo's own memory."""
-
 
 @struct
 class Nodes:

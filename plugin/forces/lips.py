@@ -1,6 +1,5 @@
 """Lips of cuts: what the two sides of a cut do to each other, see `forces/lips.h`."""
 
-# pyright: reportInvalidTypeForm=false
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ A needle is a rigid body along an arc, see `palpate.add_needle`. Its tip is pres
 until that gives way, and leaves holes in it, through which it slides; see `forces/needles.h`.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
-# pyright: reportInvalidTypeForm=false
 import dataclasses
 from typing import Any
 

@@ -1,6 +1,5 @@
 """Stress relaxation of an organ: what elastic forces leave behind; see `forces/relaxation.h`."""
 
-# pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies

@@ -1,6 +1,5 @@
 """Supports: geoms and organs that bear an organ by springs; see `forces/supports.h`."""
 
-# pyright: reportInvalidTypeForm=false
 import dataclasses
 import functools
 from typing import Any, Optional

@@ -1,6 +1,5 @@
 """Tissue that tears where it is stretched too far, across the stretch; see `Organ.cut`."""
 
-# pyright: reportInvalidTypeForm=false
 import contextlib
 
 import numpy as np

@@ -4,7 +4,6 @@ Numpy on (nvert, 3) arrays, for reports and as the reference of the tests; nothi
 a step. The energy of solids is native, since cuts in solids need it too.
 """
 
-# pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
 

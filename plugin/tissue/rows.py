@@ -3,7 +3,6 @@
 `shape` makes the arrays of all of them so, and `refill` writes those that a cut has changed.
 """
 
-# pyright: reportInvalidTypeForm=false
 from collections.abc import Callable, Mapping
 from typing import Any
 

@@ -3,7 +3,6 @@
 `solid` makes the arrays of all of it so, and `cutting.refill` writes those that a cut has changed.
 """
 
-# pyright: reportInvalidTypeForm=false
 import dataclasses
 from collections.abc import Mapping
 from typing import Any

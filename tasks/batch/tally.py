@@ -4,7 +4,6 @@ Not those that need the whole signal at once, filtered or as a spectrum, nor are
 is not in `NAMES` a recording of the single environment has.
 """
 
-# pyright: reportInvalidTypeForm=false
 import enum
 
 import warp as wp

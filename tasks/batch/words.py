@@ -3,10 +3,9 @@
 `rules` says what each of them returns.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # Vectors of Warp's are not known to type checkers:
 # pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
+# pyright: reportOperatorIssue=false
 import dis
 import functools
 import types
@@ -225,7 +224,6 @@ def pieces(s: Common):
 @word
 def tear(s: Common, o: Any, value: float):
   """See `rules`."""
-
 
 @word
 def miss(s: Common, o: Any, value: float):

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """A physics that is copied and pickled whole: what goes on from a copy goes on to the bit."""
 
 import copy

@@ -6,8 +6,6 @@ normal's reference acceleration as stiffness times gap, and a row of friction ha
 what the gap adds follows from those rows.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
-# pyright: reportInvalidTypeForm=false
 from typing import TYPE_CHECKING
 
 import mujoco

@@ -5,8 +5,6 @@ place is left empty, which mujoco_warp's kernels would run over, and which conta
 depend on who comes first.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
-# pyright: reportInvalidTypeForm=false
 import functools
 from typing import TYPE_CHECKING
 

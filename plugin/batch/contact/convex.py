@@ -1,7 +1,5 @@
 """A triangle before a mesh, by mujoco_warp's GJK and EPA, and before the box about any tool."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
-# pyright: reportInvalidTypeForm=false
 import mujoco
 import numpy as np
 import warp as wp

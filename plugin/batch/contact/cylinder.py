@@ -1,9 +1,8 @@
 """A triangle before a cylinder: where a convex function, the distance from it, is least."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 # Vectors of Warp's are not known to type checkers:
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
-# pyright: reportIndexIssue=false, reportAttributeAccessIssue=false
+# pyright: reportIndexIssue=false
 import warp as wp
 from palpate.engine.contacts import FLAT
 

@@ -1,7 +1,5 @@
 """Edges of threads that an organ's slots follow, as its last tools."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
-# pyright: reportInvalidTypeForm=false
 import warp as wp
 from palpate.engine.layout import GEOM
 from palpate.tissue.types import doubles, struct

@@ -7,8 +7,7 @@ Warp's own deterministic mode, which mujoco_warp has for all of its sums, writes
 of every kernel and sorts them all.
 """
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportReturnType=false
+# pyright: reportIndexIssue=false, reportReturnType=false
 # pyright: reportCallIssue=false, reportArgumentType=false, reportOperatorIssue=false
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false
 import contextlib

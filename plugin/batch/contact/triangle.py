@@ -1,7 +1,5 @@
 """Geometry of contacts: a triangle before an ellipsoid or an edge of a thread, and axes."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
-# pyright: reportInvalidTypeForm=false
 import warp as wp
 
 from ..mjw import private

@@ -1,6 +1,5 @@
 """What a batch tells of the geoms that cut an organ: arrays on the device, and a sensor's force."""
 
-# pyright: reportInvalidTypeForm=false
 import warp as wp
 from palpate.engine.layout import BLADE
 from palpate.forces import cutters
@@ -31,7 +30,6 @@ class Told:
 
 class Cutters(tuple_of(Told)):
   """The arrays of `Told`."""
-
 
 @wp.kernel(enable_backward=False)
 def _show(b: _WorldBlades, out: Told):

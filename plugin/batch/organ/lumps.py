@@ -5,7 +5,6 @@ linear in the triangles' factors on the modulus they were compiled with, so that
 are products with sparse matrices.
 """
 
-# pyright: reportInvalidTypeForm=false
 import math
 from typing import TYPE_CHECKING
 

@@ -1,6 +1,5 @@
 """What the tissue of each world is made of, and what follows from it for tools."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
 import dataclasses
 from typing import TYPE_CHECKING
 

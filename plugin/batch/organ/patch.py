@@ -1,6 +1,5 @@
 """An organ in all worlds of a batch: its patch of slots, and the kernels over them."""
 
-# pyright: reportInvalidTypeForm=false
 from typing import TYPE_CHECKING
 
 import mujoco

@@ -1,6 +1,5 @@
 """Windows, the nodes' side: the motion of an organ, on the CPU or on a device."""
 
-# pyright: reportInvalidTypeForm=false
 from typing import TYPE_CHECKING, Any
 
 import numpy as np

@@ -1,6 +1,5 @@
 """Windows, the slots' side: what MuJoCo and a windowed organ share, on the CPU."""
 
-# pyright: reportInvalidTypeForm=false
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 

@@ -6,7 +6,6 @@ numbers and none is added, so that what is stored by triangle stays, and so does
 arrays need.
 """
 
-# pyright: reportInvalidTypeForm=false
 import dataclasses
 from typing import Any, ClassVar
 

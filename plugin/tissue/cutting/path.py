@@ -1,6 +1,5 @@
 """Places of a surface that are nearest to points, and paths on it."""
 
-# pyright: reportInvalidTypeForm=false
 from typing import NamedTuple
 
 import numpy as np

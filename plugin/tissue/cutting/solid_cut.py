@@ -4,7 +4,6 @@ The sheet is found here, the rest is `cutting/solid/solid_cut.h`. Tetrahedra kee
 none is added, so that what is stored by tetrahedron stays, and so does the room that arrays need.
 """
 
-# pyright: reportInvalidTypeForm=false
 import dataclasses
 
 import numpy as np

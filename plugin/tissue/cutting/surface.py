@@ -1,6 +1,5 @@
 """A mesh where native code reads and writes it."""
 
-# pyright: reportInvalidTypeForm=false
 import dataclasses
 
 import numpy as np

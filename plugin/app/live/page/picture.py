@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """What a page draws: the shapes of a scene once, and where they are sixty times a second."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# mujoco ships its bindings without type stubs:
-# pyright: reportAttributeAccessIssue=false
 """What a page draws of an organ: its triangles, the finer surface over them, and its look."""
 
 import base64
