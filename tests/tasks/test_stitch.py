@@ -97,6 +97,8 @@ def test_the_needle_comes_off_by_a_tug_and_is_taken_away_once_it_is_let_go():
     for share in (0.5, 0.75, 1.0, 1.0):
       data.xfrc_applied[body, :3] = share * pull * way
       seen = env.step(still(env)).observation
+      if not seen["attached"]:
+        break  # or the free thread flies off
     assert seen["attached"] == attached
   data.xfrc_applied[:] = 0.0
   assert np.linalg.norm(seen["needle"]) < 0.03  # in the jaws still
