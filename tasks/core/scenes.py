@@ -189,6 +189,11 @@ def films(model: mujoco.MjModel, vertices: np.ndarray) -> tuple[np.ndarray, np.n
 
 def build(scene: Scene) -> mujoco.MjSpec:
   """Returns the scene, ready to be changed and compiled."""
+  return _build(scene).copy()
+
+
+@functools.lru_cache(maxsize=8)
+def _build(scene: Scene) -> mujoco.MjSpec:
   if scene.organ not in TISSUES:
     raise ValueError(f"organ is {scene.organ!r}, expected one of {', '.join(TISSUES)}")
   tissue = TISSUES[scene.organ]
