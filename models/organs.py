@@ -29,7 +29,7 @@ class Build:
     if grid:
       vertices, self.triangles = shapes.grid(entry.shape, grid, seed)
     else:
-      vertices, self.triangles = shapes.mesh(shapes.anatomy(entry.shape, seed), nodes)
+      vertices, self.triangles = shapes.organ(entry.shape, nodes, seed)
     self.vertices = np.round(vertices, 6) + 0.0
     self._seed = seed
     self.patches = shapes.patches(entry.shape, self.vertices, seed)

@@ -12,10 +12,12 @@ pylorus 1.2 cm.
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable
 
 import numpy as np
 import scipy
+from palpate.tissue import keep
 
 from .meshing.field import Field, Implicit, project, tabulate
 from .meshing.grid import shrink
@@ -142,7 +144,15 @@ def organ(name: str, nodes: int = 1000, seed: Seed = None) -> Mesh:
     nodes: their number
     seed: of the variant
   """
-  return mesh(anatomy(name, seed), nodes)
+  if isinstance(seed, np.random.RandomState):
+    return mesh(anatomy(name, seed), nodes)
+
+  def make() -> dict[str, np.ndarray]:
+    return dict(zip(("vertices", "triangles"), mesh(anatomy(name, seed), nodes), strict=True))
+
+  what = f"{name} {nodes} {seed}".encode() + keep.source(os.path.dirname(__file__))
+  made = keep.arrays("organ", what, make)
+  return made["vertices"], made["triangles"]
 
 
 liver, stomach, gallbladder, kidney, lobed = (

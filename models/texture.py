@@ -9,11 +9,13 @@ halves of the organ show: there is no seam, because the halves meet where they a
 import argparse
 import dataclasses
 import functools
+import os
 import pathlib
 from collections.abc import Sequence
 
 import numpy as np
 import scipy
+from palpate.tissue import keep
 from palpate.tissue.reading import choices
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
@@ -103,6 +105,13 @@ def texture(kind: str, seed: int = 0, size: int = SIZE) -> np.ndarray:
     raise ValueError(f"texture is {kind!r}, {choices(kind, LOOKS)}")
   if not 16 <= size <= 4096:
     raise ValueError(f"texture {kind!r}: size is {size}, expected a whole number in [16, 4096]")
+  what = f"{kind} {seed} {size}".encode() + keep.source(os.path.dirname(__file__))
+  made = keep.arrays("texture", what, lambda: {"rgb": _paint(kind, seed, size)})["rgb"]
+  made.flags.writeable = False
+  return made
+
+
+def _paint(kind: str, seed: int, size: int) -> np.ndarray:
   look, random = LOOKS[kind], np.random.RandomState([seed, list(LOOKS).index(kind)])
   at = (np.indices((size, size))[::-1].reshape(2, -1).T + 0.5) / size
   points = _unfold(at) if look.round else at
@@ -117,9 +126,7 @@ def texture(kind: str, seed: int = 0, size: int = SIZE) -> np.ndarray:
     seen = look.strength * _vessels(points, look, random)[:, None]
     out *= 1 - seen * (1 - np.array(look.tint))
   out = np.clip(0.86 * out, 0, 1)
-  made = (255 * out + 0.5).astype(np.uint8).reshape(size, size, 3)
-  made.flags.writeable = False
-  return made
+  return (255 * out + 0.5).astype(np.uint8).reshape(size, size, 3)
 
 
 def _noise(points: np.ndarray, pace: float, look: Look, random) -> np.ndarray:

@@ -2,6 +2,7 @@ import functools
 
 import numpy as np
 import pytest
+import warp as wp
 from palpate.models import shapes
 from palpate.models.meshing.field import project
 from palpate.models.meshing.grid import octasphere, spherical
@@ -193,3 +194,20 @@ def test_quality_counts_handles():
   torus = trimesh.creation.torus(0.05, 0.01)
   q = quality(torus.vertices, torus.faces)
   assert q.genus == 1 and not q.closed
+
+
+def test_what_was_made_once_is_read_from_a_file_to_the_bit(monkeypatch, tmp_path):
+  monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+  made = shapes.kidney(150, 3)
+  (file,) = tmp_path.iterdir()
+  with np.load(file) as kept:
+    np.savez(file, vertices=2 * kept["vertices"], triangles=kept["triangles"])
+  np.testing.assert_array_equal(shapes.kidney(150, 3)[0], 2 * made[0])
+  file.write_bytes(b"damaged")
+  for _ in range(2):  # made again, then read again
+    again = shapes.kidney(150, 3)
+    for one, other in zip(made, again, strict=True):
+      np.testing.assert_array_equal(one, other)
+      assert one.dtype == other.dtype
+  shapes.kidney(150, 4)
+  assert len(list(tmp_path.iterdir())) == 2

@@ -5,6 +5,7 @@ import os
 
 import numpy as np
 import pytest
+import warp as wp
 from palpate.models import shapes
 from palpate.tissue import energy, solid
 from palpate.tissue.geometry import fill, gmsh
@@ -196,11 +197,11 @@ def test_between_tetrahedra_of_a_lattice_is_nothing(scenes, name):
 
 
 def test_tetrahedra_are_kept_and_made_again_where_a_file_is_damaged(monkeypatch, tmp_path):
-  monkeypatch.setattr(fill.wp.config, "kernel_cache_dir", str(tmp_path))
+  monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
   points, elem = shapes.kidney(150)
   mesh = topology.build("kidney", np.asarray(points) * 1.01, np.asarray(elem))
   made = fill.fill("kidney", mesh)
-  (file,) = tmp_path.iterdir()
+  (file,) = tmp_path.glob("fill_*")
   with np.load(file) as kept:
     np.testing.assert_array_equal(kept["tet"], made.tet)
   for text in (b"", b"damaged", file.read_bytes()):

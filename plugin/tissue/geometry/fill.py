@@ -10,18 +10,13 @@ other diagonal: these serve as well. Where it has neither, there is an error. In
 
 import dataclasses
 import functools
-import hashlib
-import os
-import pathlib
-import tempfile
-import zipfile
 
 import numpy as np
 import scipy
-import warp as wp
 from scipy import sparse
 from scipy.sparse import csgraph, linalg
 
+from .. import keep
 from .mesh import Mesh, area_vectors, vertex_normals
 
 MOST = 2  # nodes inside for one on the surface; the plugin state has room for so many
@@ -38,7 +33,7 @@ _MOVE = 0.7  # share of the way that a node goes in a round
 FLAT = 1e-3  # quality of a tetrahedron that is none
 _SHALLOW = 0.02  # that of one between two triangles that fold by some 2 degrees
 _KEPT = 16
-_VERSION = 5  # of what is kept in files: another one where tetrahedra are made otherwise
+_VERSION = 6  # of what is kept in files: another one where tetrahedra are made otherwise
 _TIE = 1e-6  # of the size's square, by which points on one sphere are told apart
 
 # Faces of a tetrahedron, each opposite the corner of its number.
@@ -72,7 +67,7 @@ def fill(organ: str, mesh: Mesh) -> Mesh:
       f"organ {organ!r}: elements is 'solid', and at vertex {bare[0]} there is no room for "
       "tetrahedra; expected a surface that is thicker than a hundredth of its edges"
     )
-  return joined(mesh, np.frombuffer(inner).reshape(-1, 3), tet)
+  return joined(mesh, inner, tet)
 
 
 def joined(mesh: Mesh, inner: np.ndarray, tet: np.ndarray) -> Mesh:
@@ -140,40 +135,20 @@ def inside(mesh: Mesh, values: np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=_KEPT)
-def _fill(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
-  """Returns the vertices inside, the tetrahedra and the first triangle that is not among them.
+def _fill(rest: bytes, elem: bytes) -> tuple[np.ndarray, np.ndarray, int]:
+  """Returns the vertices inside, the tetrahedra and the first triangle that is not among them."""
 
-  What was filled once is kept beside Warp's kernels, by content.
-  """
-  digest = hashlib.sha256(f"{_VERSION} {len(rest)} ".encode() + rest + elem).hexdigest()[:32]
-  if not wp.config.kernel_cache_dir:  # before Warp is initialized
-    return _make(rest, elem)
-  file = pathlib.Path(wp.config.kernel_cache_dir) / f"fill_{digest}.npz"
-  try:
-    with np.load(file, allow_pickle=False) as kept:
-      return kept["inner"].tobytes(), kept["tet"], -1
-  except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-    pass
-  inner, tet, faulty = _make(rest, elem)
-  if faulty < 0:
-    _keep(file, inner=np.frombuffer(inner), tet=tet)
-  return inner, tet, faulty
+  def make() -> dict[str, np.ndarray]:
+    inner, tet, faulty = _make(rest, elem)
+    return {"inner": np.frombuffer(inner), "tet": tet, "faulty": np.array([faulty])}
+
+  found = keep.arrays("fill", f"{_VERSION} {len(rest)} ".encode() + rest + elem, make)
+  return found["inner"].reshape(-1, 3), found["tet"], int(found["faulty"][0])
 
 
 def forget():
   """Forgets the surfaces that this process has filled."""
   _fill.cache_clear()
-
-
-def _keep(file: pathlib.Path, **arrays):
-  """Writes arrays to a file, whole or not at all."""
-  try:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".part", delete=False) as part:
-      np.savez(part, **arrays)
-    os.replace(part.name, file)
-  except OSError:
-    pass  # it is made again then
 
 
 def _make(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
