@@ -27,7 +27,7 @@ def arrays(
   """
   device.init()  # which says where
   digest = hashlib.sha256(content).hexdigest()[:32]
-  file = pathlib.Path(wp.config.kernel_cache_dir) / f"{name}_{digest}.npz"
+  file = pathlib.Path(str(wp.config.kernel_cache_dir)) / f"{name}_{digest}.npz"
   try:
     with np.load(file, allow_pickle=False) as kept:
       return dict(kept)

@@ -86,7 +86,7 @@ def _digest(model: mj.MjModel) -> bytes:
   plain.flexedge_invweight0[:] = 0  # the compiler leaves one of them to chance
   content = np.empty(mj.mj_sizeModel(plain), np.uint8)
   mj.mj_saveModel(plain, None, content)
-  return hashlib.blake2b(content).digest()
+  return hashlib.blake2b(content.data).digest()
 
 
 def settle(organ: Organ, hands: Sequence[str], most: float = SETTLES) -> None:
