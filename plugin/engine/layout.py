@@ -209,6 +209,7 @@ PIERCE = Numbers(
   ("margin", 1, "m", "before its first hole, from where on it has no contacts"),
   ("close", 1, "m", "from a hole, to where its thread has none"),
   ("stop", 1, "-", "whether a bead at the thread's end is wider than the hole"),
+  ("knot", 1, "m", "thickness of its thread, 0 where a knot of it is no wider than the hole"),
 )
 
 # What holds a thread at a place, see `tissue/rod_ties.h`; in the slides' axes.

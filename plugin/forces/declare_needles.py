@@ -66,11 +66,12 @@ def strand(host: Host, needle: int) -> dict[str, Any]:
   Returns:
     flex, or -1; body of each node (n,) and its place there [m] (n, 3); rest length and stiffness of
     the edge to the next node (n, 2); frame (3, 3) and origin (3,) of its slides;
-    friction; how far from a hole it touches nothing; radius of the largest geom at its end [m]
+    friction; how far from a hole it touches nothing; radius of the largest geom at its end, and its
+    own thickness [m]
   """
   m, none = host.m, np.zeros((0, 3))
   out = {"flex": -1, "node": none[:, 0], "local": none, "edges": none[:, :2], "friction": 0.0,
-         "close": 0.0, "bead": 0.0}  # fmt: skip
+         "close": 0.0, "bead": 0.0, "thick": 0.0}  # fmt: skip
   first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
   size = mjstruct.view(m.geom_size, (m.ngeom, 3))[:, 0]
   body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
@@ -101,6 +102,7 @@ def strand(host: Host, needle: int) -> dict[str, Any]:
       "frame": frame,
       "origin": origin,
       "close": _BESIDE * (radius(host) + thick),
+      "thick": 2.0 * thick,
       "bead": float(
         size[mjstruct.view(m.geom_bodyid, m.ngeom, np.int32) == body[mine][-1]].max(initial=0.0)
       ),

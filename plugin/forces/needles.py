@@ -25,6 +25,7 @@ _FIRM = 10.0
 # How much farther than they reach contacts with a needle end before a hole, and the least, in a
 # needle's lengths: that of its point.
 _MARGIN, _POINT = 3.0, 0.1
+_KNOT = 3  # width of an overhand knot, in thicknesses of its thread
 _SAME = 1e-6  # edges of a thread within which two places where it goes through are one
 # As in the header.
 _POINTS = HOLES + 1
@@ -246,6 +247,8 @@ class Needles(Force):
       out[:, k, PIERCE.margin] = self._margin[k]
       out[:, k, PIERCE.close] = self._threads[k]["close"]
       out[:, k, PIERCE.stop] = 2 * self._threads[k]["bead"] > self._slit[k]
+      thick = self._threads[k]["thick"]
+      out[:, k, PIERCE.knot] = thick * (_KNOT * thick > self._slit[k])
     return out
 
   @property

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
+from palpate.tasks.metrics import knots
 from scenes import state
 from scenes.needles import (
   ENERGY,
@@ -387,3 +388,52 @@ def test_a_thread_follows_through_a_solid_and_tears_it(windows):
   bears = energy * np.linalg.norm(second.at - first.at) / 2
   # Friction along the thread is part of the force, some 3 %.
   assert np.linalg.norm(first.force) == pytest.approx(bears, rel=0.05)
+
+
+@pytest.mark.parametrize("knotted", [True, False])
+def test_a_knot_does_not_go_through_a_hole(knotted):
+  """Drawn tight and pulled at one end, it stops there, and the hole bears the pull."""
+  edge, way = 4.5e-4, np.array([0.0, 0.0, 1.0])
+  t = np.linspace(-2.1, 2.1, 161 if knotted else 2)
+  knot = np.stack([t**3 - 3 * t, t**4 - 4 * t**2, 0.2 * t**5 - 2 * t], axis=1)  # an overhand knot
+  knot -= knot[0]
+  along = knot[-1] / np.linalg.norm(knot[-1])
+  aside = np.cross(along, [0.0, 1.0, 0.0])
+  aside /= np.linalg.norm(aside)
+  knot = 1.2e-3 * knot @ np.column_stack([aside, np.cross(along, aside), along])
+  line = np.concatenate([[(0, 0, -0.024)], knot, [knot[-1] + 0.012 * way]])
+  line += (1e-3, 5e-4, 4e-3)
+  count = int(np.linalg.norm(np.diff(line, axis=0), axis=1).sum() / edge) + 1
+  spec = mujoco.MjSpec()
+  spec.option.timestep, spec.option.gravity = STEP, (0, 0, 0)
+  straight = line[0] + edge * np.arange(count)[:, None] * way
+  contact = {"friction": 0.1, "contype": 0, "conaffinity": 0}
+  palpate.add_thread(spec, straight, "suture", strength=0, iterations=1000, contact=contact)
+  hand = spec.worldbody.add_body(name="hand", pos=line[0] + (0, RADIUS, 0))
+  palpate.add_needle(spec, length=LENGTH, parent=hand, thread="suture")
+  spec.equality("needle_suture").active = False
+  surface, rim = sheet()
+  given = SHEET | {"foundation": 3e7, "pin": rim, "device": "cpu"}
+  palpate.add_organ(spec, surface, needles=f"needle {ENERGY}", **given)
+  model, data, organ = load(spec)
+  thread = palpate.Thread(model, data, "suture")
+  thread.lay(line)
+  organ.sew("needle")
+  tied = (1,) if knotted else ()
+  assert knots.throws(knots.closed(thread.positions)) == tied
+  ends = {0: -0.3 * way, count - 1: 0.3 * way}
+  for start, stop, steps in ((0.01, 1.0, 400), (1.0, 1.0, 200)):
+    for _ in pull(model, data, ends, start, stop, steps):
+      pass
+  for _ in pull(model, data, {count - 1: 0.3 * way}, 1.0, 0.03, 400):
+    if not organ.pinholes:
+      break
+  if not knotted:
+    assert not organ.pinholes
+    return
+  place = organ.pinholes[0].along
+  for _ in pull(model, data, {0: -0.3 * way}, 1.0, 4.0, 400):
+    pass
+  assert organ.pinholes[0].along == pytest.approx(place, abs=0.1 * edge)
+  assert organ.pinholes[0].force[2] == pytest.approx(-1.2 + 0.009, rel=0.02)
+  assert knots.throws(knots.closed(thread.positions)) == tied

@@ -66,17 +66,19 @@ PALPATE double nearest(const double* geom, int ngeom, D3 x) {
 
 PALPATE double to_share(double x) { return x < 0.0 ? 0.0 : x > 1.0 ? 1.0 : x; }
 
-// The distance of the segment from p along d to the one from q along e, which may be a point (Ericson
-// 2005, Real-Time Collision Detection, 5.1.9).
-PALPATE double between(D3 p, D3 d, D3 q, D3 e) {
+// From the segment that goes from q along e to the one from p along d, either of which may be a point, where they are
+// nearest to each other (Ericson 2005, Real-Time Collision Detection, 5.1.9).
+PALPATE D3 shortest(D3 p, D3 d, D3 q, D3 e) {
   const D3 r = p - q;
   const double dd = dot(d, d), ee = dot(e, e), de = dot(d, e), dr = dot(d, r), er = dot(e, r);
   const double apart = dd * ee - de * de;  // 0 where they are parallel
   double s = apart > 1e-6 * dd * ee ? to_share((de * er - dr * ee) / apart) : 0.0;
   const double t = ee > 0.0 ? to_share((de * s + er) / ee) : 0.0;
   s = dd > 0.0 ? to_share((de * t - dr) / dd) : 0.0;
-  return norm(r + s * d - t * e);
+  return r + s * d - t * e;
 }
+
+PALPATE double between(D3 p, D3 d, D3 q, D3 e) { return norm(shortest(p, d, q, e)); }
 
 // Whether a geom comes within `reach` of a box: its bounding sphere, or a plane itself.
 PALPATE bool comes_near(const double* geom, D3 low, D3 high, double reach) {

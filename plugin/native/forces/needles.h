@@ -24,6 +24,7 @@
 //
 // Places are in the organ's frame, places along a needle from its swage.
 #pragma once
+#include "core/geom.h"
 #include "cutting/blade_anchor.h"
 
 namespace palpate {
@@ -40,7 +41,11 @@ constexpr int BESIDE = 2;  // edges from the one that is in a hole to those that
 constexpr double HAIRPIN = 0.2;  // least share of a thread's friction along the mean of its directions, where it turns back
 constexpr double ENDS = 1e-9;   // share of a thread, or of its last edge, that is its end
 constexpr double BACK = 2e-3;   // of a needle's length that a hole goes back onto it, lest it goes to and fro
-constexpr double STOPS = 1e6;   // what a bead there bears at a hole [N]
+constexpr double STOPS = 1e6;   // what a bead there, or a knot, bears at a hole [N]
+// In thicknesses of a thread: how far before a hole a knot stops, how near in it strands are to each other, and how far
+// along the thread at least, as one that just bends is.
+constexpr double BEFORE = 2.0, TOUCHES = 1.2, TURNS = 3.0;
+constexpr double STRETCHED = 1.2;  // more than an edge ever is
 constexpr double MISSES = 0.7;  // of its way, that a hole does not follow where it is torn out
 constexpr double TIGHT = 1e-9;  // of what tissue bears, to which a return mapping brings it
 constexpr double APART = 0.5;   // edges between holes in a solid, at least
@@ -476,6 +481,39 @@ CALLED double rubs(const Fields& f, int i, const Arc& arc, const Passing& by, do
   return (share > HAIRPIN ? share : HAIRPIN) * (most + law[PIERCE_FRICTION] * length_in(f, i, arc, s, n));
 }
 
+// Whether a knot is at a hole, on the side from which the thread would slide in by a way: other parts of it are around
+// it there, which touch it from sides that face each other. A strand that lies beside it would give way.
+template <class Fields>
+CALLED bool is_knotted(const Fields& f, int i, const Passing& by, double* s, int n, int way) {
+  const double* law = f.law.data + PIERCE_LENGTH * i;
+  const double thick = law[PIERCE_KNOT], place = hole(s, n)[HOLE_THREAD];
+  const double reach = 0.5 * law[PIERCE_WALL] + BEFORE * thick, end = place - way * reach;
+  if (!(thick > 0.0) || end < 0.0) return false;
+  const auto thread = strand_of(f, i);
+  double part, start = 0.0;
+  const int e = thread.find(end, part);
+  const D3 span = thread.at(e) + part * (thread.at(e + 1) - thread.at(e)) - by.at, along = unit_of(span);
+  D3 first = {0.0, 0.0, 0.0};
+  for (int j = 0; j + 1 < thread.count;) {
+    const D3 p = thread.at(j);
+    const double length = thread.edge(j), middle = start + 0.5 * length;
+    double room = norm(p - by.at) - reach - TOUCHES * thick;
+    if (room < STRETCHED * length && fabs(middle - 0.5 * (place + end)) > 0.5 * (length + reach) + TURNS * thick) {
+      const D3 off = shortest(p, thread.at(j + 1) - p, by.at, span);
+      if (norm(off) < TOUCHES * thick) {
+        const D3 aside = across(off, along);
+        if (dot(first, aside) < 0.0) return true;
+        if (dot(first, first) == 0.0) first = aside;
+      }
+    }
+    do {  // on to where the thread may be near again
+      room -= STRETCHED * thread.edge(j);
+      start += thread.edge(j);
+    } while (++j + 1 < thread.count && room > STRETCHED * thread.edge(j));
+  }
+  return false;
+}
+
 // What a hole bears along a thread. One that has met the next presses on that, and slides on with it alone: all that have
 // met bear together what all of them rub.
 template <class Fields>
@@ -484,6 +522,7 @@ CALLED double thread_friction(const Fields& f, int i, const Arc& arc, const Pass
   const int way = by.off > 0.0 ? 1 : -1;
   const bool last = by.edge + 2 == strand_of(f, i).count;
   if (law[PIERCE_STOP] > 0.0 && last && by.part > 1.0 - ENDS && way < 0) return STOPS;
+  if (is_knotted(f, i, by, s, n, way)) return STOPS;
   double sum = rubs(f, i, arc, by, s, n);
   for (int edge = by.edge; room_on_thread(f, i, s, n, way, edge) == 0.0;) {
     const Passing other = passing(f, i, arc, s, n += way);

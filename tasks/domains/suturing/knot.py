@@ -4,8 +4,8 @@ FLS task 5, once the needle is through, up to its first throw. The thread goes t
 the drain, see `drain`: its short tail stands free on the right, its long one is in the right hand.
 One hand winds the long tail around the other's jaws, once or twice, which take the short tail and
 draw it through; both hands draw the throw down. Further throws are not in it: outside of its holes
-the thread does not meet the drain, and a knot of two throws slides through the wall along a tail
-that is drawn straight. It then holds by the friction of the holes alone.
+the thread does not meet the drain, and throws slide along a tail that is taut before the other one,
+past both holes. Pulled apart, the slit then is held by the friction of the holes alone.
 
 Jaws that press on the thread hold it: an equality joins them to the node that is between them.
 Threads meet the jaws as round, smooth bodies, on which a loop slides off: the inserts, whose
