@@ -200,6 +200,7 @@ class Thread(base.Thread):
     laid.places = wp.array(local, dtype=wp.float64, device=batch.device)
     for name in ("now", "speed", "rest", "qpos0", "qpos", "qvel", "qposadr", "dofadr"):
       setattr(laid, name, getattr(f, name))
+    batch._fresh = False
     wp.launch(kernels.lay, dim=local.shape, inputs=[laid], device=batch.device)
 
   @functools.cached_property

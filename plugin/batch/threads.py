@@ -325,7 +325,7 @@ class _Thread(base.Thread):
     return wp.array(rows, dtype=wp.float64, device="cpu")
 
   def lay(self, places: np.ndarray, mask=None):
-    organ = self.space.organ
+    organ, self._batch._fresh = self.space.organ, False
     for world in np.flatnonzero(self._batch.checked(mask).numpy()):
       model, data = self._batch.models[world], self._batch.datas[world]
       moved = (places[world] - organ.origin) @ organ.frame - organ.rest

@@ -27,7 +27,7 @@ from .contact import contacts, convex
 from .contact.fixed_order import FixedOrder, is_enough
 from .contact.rounding import Rounding, refined
 from .mjw.compiling import compile_ahead
-from .mjw.private import DeterminismType, OverflowType, uninterpolated
+from .mjw.private import DeterminismType, OverflowType, of_threads
 from .organ import host
 from .organ.organ import Organ
 from .reset import Rest
@@ -255,7 +255,7 @@ class Worlds(Batch):
   def step_tools(self):
     """Launches mujoco_warp's step, with the windows' contacts."""
     each = self._order or self._rounding
-    with uninterpolated(), each.adding() if each else refined():
+    with of_threads(), each.adding() if each else refined():
       mjw.step(self.m, self.d)
 
   def end(self):

@@ -55,9 +55,9 @@ def force(model, data, node, value):
 FREE = 'gravity="0 0 0"'
 
 
-def drum(friction, cone, kind="cylinder", h=1e-3):
+def drum(friction, cone, kind="cylinder", h=1e-3, radius=0.01):
   """Returns a thread half around a drum, its left end to be loaded, its right end on a slide."""
-  radius, tail, n = 0.01, 0.03, 81
+  tail, n = 3 * radius, 81
   r = radius + RADIUS
   s = np.linspace(0, np.pi * r + 2 * tail, n)
   angle = np.clip(np.pi - (s - tail) / r, 0, np.pi)
