@@ -148,6 +148,11 @@ def test_jaws_of_many_worlds_hold_the_thread_as_those_of_one(device):
   for tails in (seen["long_tail"], [one["long_tail"] for one in expected]):
     held, sprung = np.linalg.norm(tails, axis=1)
     assert held < 0.02 < sprung
+  seen = envs.reset(seed=8, options={"reset_mask": np.array([False, True])})[0]
+  again = alone[1].reset(seed=9)[0]
+  assert seen["right_holds"].tolist() == [[1.0], [1.0]]
+  for tail in ("short_tail", "long_tail"):
+    np.testing.assert_allclose(seen[tail], [expected[0][tail], again[tail]], atol=1e-3)
   envs.close()
 
 
