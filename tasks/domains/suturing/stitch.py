@@ -152,6 +152,10 @@ class Stitch(Knot, Stitching):
     self.meet(spec, _MEETS)
     return spec
 
+  def label(self, kind: str) -> str:
+    """Returns what an event of the rules is called: holes come before the throw."""
+    return "hole" if kind == "target" and self.holes < 2 else super().label(kind)
+
   def _stage(self, spec: mujoco.MjSpec) -> Stage:
     """Returns the stage, whose thread is not sewn."""
     return super(Knot, self)._stage(spec)
