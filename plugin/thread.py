@@ -13,6 +13,9 @@ from .tissue import config as configuration
 from .tissue import rod
 from .tissue.sutures import DIAMETER, SUTURES
 
+# Of what holds a node: time constant [s] and damping ratio, and impedance; of what holds it loosely
+# stiffness and damping, and impedance, none to speak of.
+HELD, LOOSE = ((0.004, 1.0), 0.9), ((-1e-10, -1e-10), 1e-4)
 _RGBA = (0.35, 0.2, 0.5, 1.0)  # violet, as absorbable threads are dyed
 
 
@@ -96,6 +99,29 @@ def add_thread(
   return windows.make_flex(spec, name, *placed, elem, **look)
 
 
+def holds_of(model: mujoco.MjModel, body: np.ndarray) -> dict[str, int]:
+  """Returns the equalities by which bodies can hold a node, see `Thread.hold`, by name.
+
+  Args:
+    model: compiled
+    body: of each node  (nnode,)
+  """
+  found = (
+    (model.eq_type == mujoco.mjtEq.mjEQ_CONNECT) & (model.eq_objtype == mujoco.mjtObj.mjOBJ_BODY)
+    & np.isin(model.eq_obj2id, body) & (model.eq_active0 == 0)
+  )  # fmt: skip
+  return {model.equality(int(k)).name: int(k) for k in np.flatnonzero(found)}
+
+
+def no_hold(thread: str, name: str, holds: Mapping[str, int]) -> ValueError:
+  """Returns the error that says by what a thread can be held."""
+  have = ", ".join(map(repr, holds)) or "none"
+  return ValueError(
+    f"thread {thread!r}: {name!r} does not hold it, expected a connect of a body and a node that "
+    f"is not active at first; the scene has {have}"
+  )
+
+
 class Thread:
   """Places, tension and twist of a thread, in world coordinates and SI units.
 
@@ -161,6 +187,33 @@ class Thread:
     local = (places - organ.origin) @ organ.frame - organ.rest[which]
     self.data.qpos[at] = self.model.qpos0[at] + local
     self.data.qvel[organ.dofs.reshape(-1, 3)[which]] = 0.0
+
+  def hold(self, by: str, node: int, anchor: Sequence[float] = (0, 0, 0), firm: bool = True):
+    """Lets a body hold a node, or none; near the node the thread does not meet that body.
+
+    Args:
+      by: name of a <connect> of the body and a node, whichever, that is not active at first
+      node: that is held from now on; -1 for none
+      anchor: where in the body [m]  (3,)
+      firm: whether the body bears on the node; otherwise the two just do not meet
+
+    Raises:
+      ValueError: an argument is not allowed.
+    """
+    organ, model = self._space.organ, self.model
+    holds, nnode = holds_of(model, organ.body), len(organ.rest)
+    if by not in holds:
+      raise no_hold(self.name, by, holds)
+    if not -1 <= node < nnode:
+      raise ValueError(f"thread {self.name!r}: node is {node}, expected one in [-1, {nnode})")
+    which = holds[by]
+    self.data.eq_active[which] = node >= 0
+    if node >= 0:
+      solref, impedance = HELD if firm else LOOSE
+      model.eq_obj2id[which] = organ.body[node]
+      model.eq_data[which, :6] = *anchor, 0.0, 0.0, 0.0
+      model.eq_solref[which] = solref
+      model.eq_solimp[which, :2] = impedance
 
   @property
   def length(self) -> float:

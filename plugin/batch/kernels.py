@@ -52,6 +52,41 @@ def put_back(m: Move):
     m.geom_xmat[w, g] = m.xmat[w, g]
 
 
+@theirs(model="eq_data eq_solref eq_solimp", data="eq_active")
+class Holding:
+  """By which of its nodes a body holds a thread in each world."""
+
+  first: int  # of the equalities of the body and each node
+  nnode: int
+  node: ints("nworld")  # that is held, -1 for none
+  anchor: floats("nworld", 3)  # where in the body [m]
+  firm: Array(wp.bool, ("nworld",))  # whether the body bears on it
+  solref: wp.vec2  # of the equality where it does
+  impedance: float
+  loose_solref: wp.vec2  # and where not
+  loose_impedance: float
+
+
+@wp.kernel(enable_backward=False)
+def hold(h: Holding):
+  """Joins the node that is held to the body, and no other."""
+  w, k = wp.tid()
+  e = h.first + k
+  h.eq_active[w, e] = h.node[w] == k
+  if h.node[w] == k:
+    firm = h.firm[w]
+    data = h.eq_data[w, e]
+    solimp = h.eq_solimp[w, e]
+    for c in range(3):
+      data[c] = h.anchor[w, c]
+      data[3 + c] = 0.0
+    for c in range(2):
+      solimp[c] = wp.where(firm, h.impedance, h.loose_impedance)
+    h.eq_data[w, e] = data
+    h.eq_solimp[w, e] = solimp
+    h.eq_solref[w, e] = wp.where(firm, h.solref, h.loose_solref)
+
+
 @struct
 class Sensed:
   """What the sensors of the steps of a call come to."""
@@ -229,6 +264,35 @@ def show_rod(
     for c in range(3):
       x[a] += float(frame[a, c] * now[w, i, c])
   out[w, i] = origin + x
+
+
+@struct
+class Laid:
+  """Where a thread is laid, and its fields of `rods.WorldRods`."""
+
+  mask: Array(wp.bool, ("nworld",))  # worlds
+  places: doubles("nworld", "nnode", 3)  # in the slides' axes [m]
+  now: doubles("nworld", "nnode", 3)
+  speed: doubles("nworld", "nnode", 3)
+  rest: doubles("nnode", 3)
+  qpos0: floats("nq")
+  qpos: floats("nworld", "nq")
+  qvel: floats("nworld", "nv")
+  qposadr: ints("nnode")
+  dofadr: ints("nnode")
+
+
+@wp.kernel(enable_backward=False)
+def lay(f: Laid):
+  """Puts nodes at places, at rest."""
+  w, i, c = wp.tid()
+  if f.mask[w] and f.dofadr[i] >= 0:
+    x = f.places[w, i, c]
+    f.now[w, i, c] = x
+    f.speed[w, i, c] = wp.float64(0.0)
+    zero = wp.float64(f.qpos0[f.qposadr[i] + c]) - f.rest[i, c]
+    f.qpos[w, f.qposadr[i] + c] = float(x + zero)
+    f.qvel[w, f.dofadr[i] + c] = 0.0
 
 
 @wp.kernel(enable_backward=False)

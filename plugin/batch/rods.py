@@ -15,10 +15,12 @@ import warp as wp
 from palpate.engine import layout, rods
 from palpate.engine.coupling import Ties
 from palpate.engine.rods import Rod
+from palpate.thread import HELD, LOOSE, holds_of
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import DIMS, Array, also, doubles, fill, floats, ints
 
 from . import base, kernels
+from .base import on_device
 from .contact.contact_rows import Early, take_early
 from .mjw.arrays import arrays_of, theirs
 
@@ -88,6 +90,7 @@ class Thread(base.Thread):
   def __init__(self, batch: "Worlds", space: rods.Workspace):
     organ, bare, device, nworld = space.organ, batch.bare, batch.device, batch.nworld
     self.name, self.space, self.declared, self._batch = organ.name, space, organ, batch
+    self.nworld, self.holds = nworld, holds_of(batch.model, organ.body)
     n, m, d = len(organ.rest), batch.m, batch.d
     kept_qpos, kept_dof = batch.kept
     dofadr = np.where(organ.free, np.searchsorted(kept_dof, organ.dofadr), -1)
@@ -103,7 +106,7 @@ class Thread(base.Thread):
       name: wp.zeros((nworld, span.stop - span.start), dtype=wp.float64, device=device)
       for name, span in spans.items()
     }
-    self.broken = own["broken"]
+    self._broken = own["broken"]
     scratch = rods.scratch(n, bare.nv).items()
     each = {name: _rows(Rod, name, start, nworld, device) for name, start in scratch}
     self.iterations = each["status"]
@@ -178,9 +181,51 @@ class Thread(base.Thread):
   @property
   def tension(self) -> wp.array:
     """Tension of each edge [N], (nworld, nnode - 1)."""
-    inputs = [self.fields.now, self._springs, self.broken, self._tension]
+    inputs = [self.fields.now, self._springs, self._broken, self._tension]
     wp.launch(kernels.pull_rod, dim=self._tension.shape, inputs=inputs, device=self._batch.device)
     return self._tension
+
+  @property
+  def broken(self) -> wp.array:
+    """1 where an edge has broken, of float64 (nworld, nnode); the last one is of no edge."""
+    return self._broken
+
+  def lay(self, places: np.ndarray, mask=None):
+    """Puts the nodes of worlds at places, at rest, see `base.Thread`."""
+    f, organ, batch = self.fields, self.declared, self._batch
+    local = (np.asarray(places, float) - organ.origin) @ organ.frame
+    laid: Any = kernels.Laid()
+    laid.mask = batch.checked(mask)
+    laid.places = wp.array(local, dtype=wp.float64, device=batch.device)
+    for name in ("now", "speed", "rest", "qpos0", "qpos", "qvel", "qposadr", "dofadr"):
+      setattr(laid, name, getattr(f, name))
+    batch._fresh = False
+    wp.launch(kernels.lay, dim=local.shape, inputs=[laid], device=batch.device)
+
+  @functools.cached_property
+  def _holding(self) -> dict[str, Any]:
+    """What `kernels.hold` takes, by the name of an equality of the scene."""
+    batch, nnode = self._batch, len(self.declared.rest)
+    node = batch.numbers[self.declared.body[0]]  # of the equalities that were added for it
+    first = batch.model.neq + np.flatnonzero(batch.bare.eq_obj2id[batch.model.neq :] == node)
+    (solref, impedance), (loose_solref, loose_impedance) = HELD, LOOSE
+    shared = dict(
+      nnode=nnode, solref=wp.vec2(*solref), impedance=impedance,
+      loose_solref=wp.vec2(*loose_solref), loose_impedance=loose_impedance,
+      **arrays_of(kernels.Holding, batch.m, batch.d),
+    )  # fmt: skip
+    out = {}
+    for name, start in zip(self.holds, first, strict=True):
+      out[name] = kernels.Holding()
+      for field, value in (shared | {"first": int(start)}).items():
+        setattr(out[name], field, value)
+    return out
+
+  def _hold(self, by: str, node, anchor, firm):
+    h, device = self._holding[by], self._batch.device
+    h.node, h.firm = on_device(node, wp.int32, device), on_device(firm, wp.bool, device)
+    h.anchor = on_device(anchor, wp.float32, device)
+    wp.launch(kernels.hold, dim=(self.nworld, h.nnode), inputs=[h], device=device)
 
   def pull(self, world: int, data: mujoco.MjData):
     """Writes its state in a world to an mjData."""

@@ -77,7 +77,7 @@ def pull(batch: Worlds, world: int, data: mujoco.MjData):
   if model.nmocap:
     data.mocap_quat[:] = d.mocap_quat[world].numpy()
   if model.neq:
-    data.eq_active[:] = d.eq_active[world].numpy()
+    data.eq_active[:] = d.eq_active[world].numpy()[: model.neq]
   data.time = d.time[world : world + 1].numpy()[0]
   for organ in batch.organs.values():
     _pull_organ(organ, world, model, data)
@@ -166,7 +166,9 @@ def push(batch: Worlds, world: int, data: mujoco.MjData):
     _assign(getattr(d, name), world, getattr(data, name))
   _assign(d.qacc_warmstart, world, np.zeros(d.qacc_warmstart.shape[1]))
   _assign(d.mocap_quat, world, data.mocap_quat)
-  _assign(d.eq_active, world, data.eq_active.astype(bool))
+  active = np.zeros(d.eq_active.shape[1], bool)  # nothing holds a thread, see `rods.Thread`
+  active[: model.neq] = data.eq_active
+  _assign(d.eq_active, world, active)
   poses = (d.geom_xpos, scratch.geom_xpos), (d.geom_xmat, scratch.geom_xmat)
   for array, values in poses if model.ngeom else ():
     row = array[world].numpy()

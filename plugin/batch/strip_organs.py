@@ -18,6 +18,7 @@ from palpate import windows
 from palpate.engine import contacts
 from palpate.engine.contacts import TISSUE
 from palpate.engine.model import flexes, mjstruct, prepare
+from palpate.thread import holds_of
 
 from .contact.contacts import KINDS
 
@@ -136,6 +137,8 @@ def strip(
   masses = [0.1 * float(organ.mass[organ.free & (organ.mass > 0)].min()) for organ in organs]
   for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
     _add_slots(bare, organ, nslot, mass, model)
+  for thread in threads:
+    _add_holds(bare, thread, model)
   if any(sensor.type == mujoco.mjtSensor.mjSENS_TOUCH for sensor in bare.sensors):
     # They take the other side of a flex's contact, geom -1, for the last geom: it touches nothing.
     last = bare.body(f"{organs[-1].name}_slot_{nslots[-1] - 1}")
@@ -154,7 +157,7 @@ def strip(
     made.opt.impratio = max(made.opt.impratio, *sticks, 0)
   if made.nv <= 60 and made.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON:
     made.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-  _check(model, made, organs, nslots)
+  _check(model, made, organs, nslots, threads)
   for flex, thread in enumerate(threads):
     assert flex == mujoco.mj_name2id(made, mujoco.mjtObj.mjOBJ_FLEX, thread.name)
     start = made.flex_vertadr[flex]
@@ -237,10 +240,31 @@ def _add_slots(bare, organ: Declaration, nslot: int, mass: float, model):
   made.condim = int(model.flex_condim[flex])
 
 
-def _check(model, made, organs: list, nslots: list[int]):
+def _add_holds(bare, thread, model):
+  """Adds equalities of each node of a thread for each that can hold any of them.
+
+  mujoco_warp has the two bodies of an equality in all worlds.
+  """
+  for which in holds_of(model, thread.body).values():
+    holder = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.eq_obj1id[which]))
+    for body in thread.body:
+      node = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(body))
+      bare.add_equality(
+        type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=holder, name2=node,
+        active=False,
+      )  # fmt: skip
+
+
+def holds_count(model, threads: list) -> int:
+  """Returns how many equalities there are of `_add_holds`."""
+  return sum(len(holds_of(model, thread.body)) * len(thread.body) for thread in threads)
+
+
+def _check(model, made, organs: list, nslots: list[int], threads: list):
   """Raises ValueError where something of the scene hung on what was taken out."""
+  more = {"neq": holds_count(model, threads)}
   for name in _COUNTED:
-    before, after = getattr(model, name), getattr(made, name)
+    before, after = getattr(model, name), getattr(made, name) - more.get(name, 0)
     if before != after:
       raise ValueError(
         f"{name} is {before} and would be {after} without the organs' nodes: an actuator, sensor, "

@@ -18,7 +18,7 @@ from palpate.engine import plugin as engine
 from palpate.engine.cutting import cuts as cutting
 from palpate.engine.model.declare import Declaration
 from palpate.organ import Organ, instances
-from palpate.thread import Thread
+from palpate.thread import Thread, holds_of
 from palpate.tissue import body as bodies
 from palpate.tissue.cutting.topology import Report
 from palpate.tissue.device import free_memory, refuse_crowd
@@ -306,8 +306,10 @@ class _Thread(base.Thread):
   def __init__(self, batch: Threads, name: str):
     pairs = zip(batch.models, batch.datas, strict=True)
     self.name, self.handles = name, [Thread(model, data, name) for model, data in pairs]
+    self._batch = batch
     number = instances(batch.model, dim=1)[name]
     self.space = engine.find_thread(batch.datas[0]._address, number)
+    self.nworld, self.holds = batch.nworld, holds_of(batch.model, self.space.organ.body)
 
   @property
   def xpos(self) -> wp.array:
@@ -316,6 +318,25 @@ class _Thread(base.Thread):
   @property
   def tension(self) -> wp.array:
     return wp.array([each.tension for each in self.handles], dtype=float, device="cpu")
+
+  @property
+  def broken(self) -> wp.array:
+    rows = [np.append(each.broken, False) for each in self.handles]
+    return wp.array(rows, dtype=wp.float64, device="cpu")
+
+  def lay(self, places: np.ndarray, mask=None):
+    organ, self._batch._fresh = self.space.organ, False
+    for world in np.flatnonzero(self._batch.checked(mask).numpy()):
+      model, data = self._batch.models[world], self._batch.datas[world]
+      moved = (places[world] - organ.origin) @ organ.frame - organ.rest
+      data.qpos[organ.qposs] = model.qpos0[organ.qposs] + moved[organ.free].ravel()
+      data.qvel[organ.dofs] = 0.0
+
+  def _hold(self, by: str, node, anchor, firm):
+    given = node, anchor, firm
+    rows = (each.numpy() if isinstance(each, wp.array) else np.asarray(each) for each in given)
+    for handle, *row in zip(self.handles, *rows, strict=True):
+      handle.hold(by, *row)
 
 
 def _copy_state(model, data, other_model, other):

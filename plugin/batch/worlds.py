@@ -25,7 +25,7 @@ from .contact import contacts, convex
 from .contact.fixed_order import FixedOrder, is_enough
 from .contact.rounding import Rounding, refined
 from .mjw.compiling import compile_ahead
-from .mjw.private import DeterminismType, OverflowType, uninterpolated
+from .mjw.private import DeterminismType, OverflowType, of_threads
 from .organ import host
 from .organ.organ import Organ
 from .reset import Rest
@@ -132,7 +132,8 @@ class Worlds(Batch):
     each = 1 if condim == 1 else 2 * (condim - 1) if self.paired else condim
     most += [rods.most_contacts(w) for w in sewn]
     between = _CONTACTS if strip_organs.tools_meet(bare) else 0
-    self.njmax = strip_organs.rows_of(bare) + (between + sum(most)) * each
+    held = bare.neq - model.neq  # of which one at a time is active, in place of one of the scene's
+    self.njmax = strip_organs.rows_of(bare) - 6 * held + (between + sum(most)) * each
     ncon = between + sum(most)
     times = 3 if deterministic else 1  # rows are kept, and spread over all dofs
     size = states.bytes_of(bare, times * self.njmax, ncon) + sum(
@@ -145,6 +146,7 @@ class Worlds(Batch):
       bare.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     try:
       own = ("dof_armature", "body_invweight0", "body_pos", "body_quat", "geom_friction")
+      own += ("eq_data", "eq_solref", "eq_solimp") if held else ()
       sizes: dict[str, int] = {name: nworld for name in own}
       self.m = mjw.put_model(bare, batch_sizes=sizes)
     except (NotImplementedError, ValueError) as error:
@@ -251,7 +253,7 @@ class Worlds(Batch):
   def step_tools(self):
     """Launches mujoco_warp's step, with the windows' contacts."""
     each = self._order or self._rounding
-    with uninterpolated(), each.adding() if each else refined():
+    with of_threads(), each.adding() if each else refined():
       mjw.step(self.m, self.d)
 
   def end(self):

@@ -49,6 +49,8 @@ class Other(Posed, Second):
 class Resting(Posed, Physics):
   """The physics of an exercise while its organ rests, which is not stepped to answer."""
 
+  rests = True
+
   def use(
     self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN, second: str = ""
   ) -> None:
@@ -162,7 +164,8 @@ class Episodes:
     frame["eye"] = self.physics.camera()[0]
     frame["reference"] = np.array(self._task.reference_length() or 0.0)
     task = self._task
-    return frame | dict(self._draw_own(task)) | dict(task.tissue()) | task.joints | task.bodies
+    frame |= dict(self._draw_own(task)) | dict(task.tissue())
+    return frame | task.joints | task.bodies | task.threads
 
 
 def of_physics(physics: Any) -> dict[str, Any]:

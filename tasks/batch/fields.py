@@ -11,6 +11,7 @@ from palpate.tasks.core.rules import OUTCOMES
 from palpate.tissue.types import Array, doubles, floats, ints, struct
 
 flags = Array(wp.bool, ("nworld",))
+VIEWS = 8  # in which the throw of a thread is looked for
 
 
 @struct
@@ -81,7 +82,17 @@ class Common:
   hole_rest: floats("nworld", "nneedle", HOLES, 3)  # [m]
   hole_along: floats("nworld", "nneedle", HOLES)  # [m]
   hole_torn: floats("nworld", "nneedle", HOLES)  # [m]
-  tension: floats("nworld", "nedge")  # of each edge of the thread [N]
+  # Of the thread, and of what jaws hold of it, see `rules.hold`.
+  tension: floats("nworld", "nedge")  # of each edge [N]
+  strand: floats("nworld", "nnode", 3)  # where the nodes are [m]
+  broken: doubles("nworld", "nnode")  # 1 where an edge has broken
+  held_node: ints("nhand", "nworld")  # -1 for none
+  held_place: floats("nhand", "nworld", 3)  # in the body that holds it [m]
+  held_firm: Array(wp.bool, ("nhand", "nworld"))
+  held_tip: Array(wp.vec3, ("nhand",))  # the tip in that body [m]
+  views: Array(wp.mat33, (VIEWS,))  # frames that the thread is seen in
+  crossing: floats("nworld", "ncrossing", 3)  # over and under, along the thread; its sign
+  relation: doubles("nworld", "ncrossing", "ncrossing")  # scratch
   # Of the other hand.
   other_tip_pos: floats("nworld", 3)
   other_tip_quat: floats("nworld", 4)

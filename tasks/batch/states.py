@@ -23,10 +23,11 @@ class States:
     advance: kernel (fields, records)
     observe: kernel (fields, records, beginning)
     act: the same of what an action does besides, or None
+    begin: the same of what follows the beginning of an episode, or None
   """
 
   def __init__(self, own: Rules, task: Any, nworld: int, device: Any):
-    self.kind, self.advance, self.observe, self.act = compiled(own)
+    self.kind, self.advance, self.observe, self.act, self.begin = compiled(own)
     self._fields, self._dtype = own.fields, self.kind.numpy_dtype()
     self._dtype = np.dtype(self._dtype)
     self.rows: dict[str, wp.array] = {}

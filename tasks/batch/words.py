@@ -16,7 +16,7 @@ from palpate.tasks.core import instrument, rules
 from palpate.tasks.core.rules import Rules
 from palpate.tissue.types import Array
 
-from . import kernels
+from . import kernels, throws
 from .fields import Common
 
 _CLOSING, _GRIPPING = wp.constant(instrument.CLOSING), wp.constant(instrument.GRIPPING)
@@ -134,6 +134,56 @@ def taut(s: Common):
   for k in range(1, s.tension.shape[1]):
     most = wp.max(most, s.tension[s.world, k])
   return most
+
+
+@word
+def jaws(s: Common, hand: int):
+  if hand == 0:
+    return s.gripper[s.world, 0], s.gripper[s.world, 1]
+  return s.other_gripper[s.world, 0], s.other_gripper[s.world, 1]
+
+
+@word
+def in_hand(s: Common, hand: int, place: wp.vec3):
+  if hand == 0:
+    return wp.quat_rotate_inv(_turn(s.tip_quat, s.world), place - tip(s))
+  return wp.quat_rotate_inv(_turn(s.other_tip_quat, s.world), place - other_tip(s))
+
+
+@word
+def vertex(s: Common, k: int):
+  return kernels.node(s, s.world, k)
+
+
+@word
+def strand(s: Common, k: int):
+  return kernels.entry(s.strand, s.world, k)
+
+
+@word
+def strands(s: Common):
+  return s.strand.shape[1]
+
+
+@word
+def snapped(s: Common):
+  most = wp.float64(0.0)
+  for k in range(s.broken.shape[1]):
+    most = wp.max(most, s.broken[s.world, k])
+  return most > wp.float64(0.0)
+
+
+@word
+def hold(s: Common, hand: int, node: int, place: wp.vec3, firm: bool):
+  s.held_node[hand, s.world] = node
+  s.held_firm[hand, s.world] = firm
+  for k in range(3):
+    s.held_place[hand, s.world, k] = place[k] + s.held_tip[hand][k]
+
+
+@word
+def throw(s: Common):
+  return throws.throw(s, s.world)
 
 
 @word
@@ -318,7 +368,7 @@ def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:
 
 
 @functools.cache
-def compiled(own: Rules) -> tuple[Any, Any, Any, Any]:
+def compiled(own: Rules) -> tuple[Any, Any, Any, Any, Any]:
   """Returns the struct of a domain's state, and the kernels of its rules."""
   module, known = wp.get_module(own.state.__module__), dict(WORDS)
   kinds = {
@@ -348,5 +398,8 @@ def compiled(own: Rules) -> tuple[Any, Any, Any, Any]:
 
   after = wp.kernel(advance, module=module, enable_backward=False)
   look = following("observe", translate(own.observe, module, known))
-  act = following("act", translate(own.act, module, known)) if own.act else None
-  return state, after, look, act
+  act, begin = (
+    following(name, translate(rule, module, known)) if rule else None
+    for name, rule in (("act", own.act), ("begin", own.begin))
+  )
+  return state, after, look, act, begin

@@ -19,7 +19,7 @@ from palpate.tasks.core.scenes import GUIDED
 from palpate.tasks.core.stage import STATE
 from palpate.tissue.types import allocate
 
-from . import kernels, tally
+from . import kernels, tally, throws
 from .episodes import FRAME, HAND, Episodes, at_rest, of_physics, rows_of
 from .fields import OBSERVED, Common
 from .pictures import Pictures
@@ -67,6 +67,7 @@ class Worlds:
     self.states = States(task.rules, task, nworld, self.device)
     self.episodes = Episodes(task, self.states.draw, nworld)
     self.organ, self._tissue = self.batch.organ(task.organ), tuple(task.tissue())
+    self._holds = list[tuple[int, str]]()  # hands, and by what they hold a thread
     dt = environment.control_timestep()
     self._steps = self.batch.watch(self._substeps)
     self.fields, self.other, self.guided = self._make(task, task.prefix, dt, limit), None, None
@@ -121,7 +122,7 @@ class Worlds:
       naction=len(task.components), naxis=len(names), ncontrol=len(names) + 1,
       nside=model.ngeom + 1, nspot=len(getattr(task, "disc", ())), nbond=len(physics.organ.bonds),
       ncutter=len(physics.organ.cutters), nneedle=len(physics.organ.needles),
-      nedge=len(physics.thread.tension) if physics.thread else 0,
+      **self._sizes_of_thread(physics if prefix == task.prefix else None),
     )  # fmt: skip
     s = allocate(Common, self.device, sizes)
     s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
@@ -132,7 +133,8 @@ class Worlds:
     controls = model.actuator_ctrlrange[[*drives, s.fifth if s.fifth >= 0 else drives[0]]]
     coarse = physics.coarse
     constants = {
-      "drive": drives, "low": controls[:, 0], "high": controls[:, 1],
+      "held_tip": [model.site(f"{hand.prefix}tip").pos for hand in physics.hands[:len(s.held_tip)]],
+      "views": throws.views(), "drive": drives, "low": controls[:, 0], "high": controls[:, 1],
       "move": DRIVE_RATES[: len(names)] * dt, "wrist": port.wrist or (0.0, 0.0),
       "elem": self.organ.elem, "coarse": coarse, "coarse0": physics.organ.xpos0[coarse],
     }  # fmt: skip
@@ -150,6 +152,25 @@ class Worlds:
     s.sensor_mean, s.sensor_steps = batch.sensor_mean, self._steps
     self._read(s)
     return s
+
+  def _sizes_of_thread(self, physics: Any) -> dict[str, int]:
+    """Returns how many edges and nodes a thread has, and hands that may hold it."""
+    if not physics or not physics.thread:
+      return dict.fromkeys(("nedge", "nnode", "nhand", "ncrossing"), 0)
+    nnode, holds = len(physics.thread.positions), self.batch.thread(physics.thread.name).holds
+    self._holds = [
+      (k, name) for k, hand in enumerate(physics.hands)
+      if (name := f"{hand.prefix}{physics.thread.name}") in holds
+    ]  # fmt: skip
+    count = len(self._holds)
+    return {"nedge": nnode - 1, "nnode": nnode, "nhand": count, "ncrossing": count and throws.MOST}
+
+  def _hold(self) -> None:
+    """Lets jaws hold what rules say."""
+    s = self.fields
+    for k, name in self._holds:
+      (thread,) = self.batch.threads.values()
+      thread.hold(name, s.held_node[k], s.held_place[k], s.held_firm[k])
 
   def _count(self, task: Any) -> Any:
     """Returns the sums that metrics are made of."""
@@ -206,7 +227,7 @@ class Worlds:
       s.hole_rest, s.hole_along, s.hole_torn = found.hole_rest, found.hole_along, found.hole_torn
     if s.tension.shape[1]:
       (thread,) = self.batch.threads.values()
-      s.tension = thread.tension
+      s.tension, s.strand, s.broken = thread.tension, thread.xpos, thread.broken
 
   # Doing.
 
@@ -295,6 +316,7 @@ class Worlds:
     if self.fields.behind.shape[1]:
       self.launch(kernels.hide, self.fields.behind.shape, [self.fields])
     self._over(self.states.advance, self.states.records)
+    self._hold()
     self._over(tally.add, self.tally)
     if self.other:
       self.launch(tally.add, self.nworld, [self.other, self._tally])
@@ -362,6 +384,8 @@ class Worlds:
     if self.task.joints:
       values = np.concatenate([rows[name] for name in self.task.joints], axis=1)
       self.batch.pose([*self.task.joints], values, s.begun)
+    for name in self.task.threads:
+      self.batch.thread(name).lay(rows[name], s.begun)
     if self._tissue:
       self.organ.configure(mask, **{key: rows[key] for key in self._tissue})
     self.run(self._open)
@@ -384,6 +408,9 @@ class Worlds:
     for hand in self.instruments.values():
       self.launch(kernels.begin, self.nworld, [hand])
     self._measure(True)
+    if self.states.begin:
+      self._over(self.states.begin, self.states.records, True)
+      self._hold()
     self._over(tally.start, self.tally)
     if self.other:
       self.launch(tally.start, self.nworld, [self.other, self._tally])

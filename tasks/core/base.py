@@ -88,6 +88,7 @@ class Task(engine.Task):
     cost: of the last control step, see `safety`
     joints: positions that an episode begins with, by joint, beside the instruments'
     bodies: places and orientations that it begins with, by body without joints  (7,)
+    threads: places of the nodes that it begins with, by thread  (nnode, 3)
     harm: what costs have taken from the dense reward so far, 0.55 at most [-]
     events: since the last `take_events`
   """
@@ -168,6 +169,7 @@ class Task(engine.Task):
     self.observed = observation.choose(observations, pixels)
     self.joints: dict[str, np.ndarray] = {}
     self.bodies: dict[str, np.ndarray] = {}
+    self.threads: dict[str, np.ndarray] = {}
     self.ranges, self.drawn = randomisation.check(randomise or {}), dict[str, Any]()
     self._models: dict[int | None, Stage] = {}
     if model is not None:
@@ -368,6 +370,8 @@ class Task(engine.Task):
     self._place_instrument(physics)
     self.begin(physics)
     physics.put(self.joints, self.bodies)
+    if self.rules and self.rules.begin and not physics.rests:
+      self.rules.begin(physics, self)
     self.show(physics)
     self.nodes0 = physics.nodes()
     self.start = physics.tip_pos()

@@ -38,6 +38,7 @@ class Physics(Instrument, Portable):
     thread: the scene's thread, None for none
     looked: where `look_from` has put the laparoscope, and its orientation; None where it stands
     eyes: what draws pictures without OpenGL, once it did
+    rests: whether nothing moves in it: episodes are drawn from it alone
     meanwhile: called in the middle of every `step`, with what need not be done at its end, where a
       live exercise has least time; None for nothing
   """
@@ -47,6 +48,7 @@ class Physics(Instrument, Portable):
   looked: np.ndarray | None = None
   thread: Thread | None = None
   eyes: Any = None
+  rests = False
   meanwhile: Callable[[], None] | None = None
 
   def use(

@@ -19,6 +19,8 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array
 
+from ..metrics import knots
+
 RUNNING, SUCCESS, DAMAGED, MISSED = range(4)
 HIDDEN, LATER, NOW = range(3)  # looks of a mark
 FAR = 1e9  # farther than anything [m]
@@ -48,6 +50,7 @@ class Rules:
     observe: rule (s, o) that returns o with its own observations up to date
     observed: fields of the state that are these
     metrics: of the domain's own, by the field that is an episode's value so far
+    begin: rule (s, o) that returns o as an episode begins and the physics can be asked, or None
     act: rule (s, o) that returns o once an action has moved the drives, before the physics, or None
     shared: arrays of the state that are the same in all worlds and episodes
     mark: rule (s, o, k) that returns where the pictures' mark k is [m], and its look, one of
@@ -61,6 +64,7 @@ class Rules:
   observe: Callable
   observed: tuple[str, ...]
   metrics: Mapping[str, str] = dataclasses.field(default_factory=dict)
+  begin: Callable | None = None
   act: Callable | None = None
   shared: tuple[str, ...] = ()
   mark: Callable | None = None
@@ -70,8 +74,8 @@ class Rules:
     where = f"{self.state.__module__}.{self.state.__qualname__}"
     for name, rule in vars(self).items():
       given = {"mark": "s, o and k"}
-      given |= dict.fromkeys(("advance", "observe", "act", "shaping"), "s and o")
-      if name not in given or (rule is None and name in ("act", "mark")):
+      given |= dict.fromkeys(("advance", "observe", "begin", "act", "shaping"), "s and o")
+      if name not in given or (rule is None and name in ("begin", "act", "mark")):
         continue
       count = 2 + (name == "mark")
       if not inspect.isfunction(rule) or len(inspect.signature(rule).parameters) != count:
@@ -285,6 +289,61 @@ def torn_at(s: Any, k: int) -> float:
 def taut(s: Any) -> float:
   """Returns the largest tension of the needle's thread [N]."""
   return float(s.thread.tension.max())
+
+
+def jaws(s: Any, hand: int) -> tuple[float, float]:
+  """Returns the opening of a hand's jaws, and what they are told [rad]."""
+  opening, target = s.hands[hand].gripper()[:2]
+  return float(opening), float(target)
+
+
+def in_hand(s: Any, hand: int, place: np.ndarray) -> np.ndarray:
+  """Returns a place in the frame of a hand's tip [m]."""
+  return s.hands[hand].from_tip(place)
+
+
+def vertex(s: Any, k: int) -> np.ndarray:
+  """Returns where a vertex of the organ is [m]."""
+  return s.nodes()[k]
+
+
+def strand(s: Any, k: int) -> np.ndarray:
+  """Returns where a node of the thread is [m]."""
+  return s.thread.positions[k]
+
+
+def strands(s: Any) -> int:
+  """Returns how many nodes the thread has."""
+  return len(s.thread.tension) + 1
+
+
+def snapped(s: Any) -> bool:
+  """Returns whether the thread has broken."""
+  return bool(s.thread.broken.any())
+
+
+def hold(s: Any, hand: int, node: int, place: np.ndarray, firm: bool) -> None:
+  """Lets a hand's jaws hold a node of the thread at a place in the frame of the tip [m].
+
+  Args:
+    s: the world
+    hand: which
+    node: -1 for none
+    place: where it is held
+    firm: whether they bear on it, see `palpate.Thread.hold`
+  """
+  prefix = s.hands[hand].prefix
+  tip = s.model.ptr.site(f"{prefix}tip").pos
+  s.thread.hold(f"{prefix}{s.thread.name}", int(node), place + tip, firm)
+
+
+def throw(s: Any) -> int:
+  """Returns how often the thread is wound about itself in its one throw, 0 where it has no knot.
+
+  -1 where it has another knot, or is too tangled to tell.
+  """
+  found = knots.throws(knots.closed(s.thread.positions), 1)
+  return -1 if found is None else sum(map(abs, found))
 
 
 def lens(s: Any) -> np.ndarray:

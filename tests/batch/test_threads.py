@@ -79,6 +79,17 @@ def test_a_thread_around_a_drum_obeys_the_capstan_law(device, cone, kind):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_a_thread_lies_on_a_thin_jaw_with_all_its_edges(device):
+  """They are 0.2 mm long; mujoco_warp keeps one contact a millimetre."""
+  model, data, thread, worlds = scene(one.drum(0.3, "elliptic", "capsule", radius=0.002), device)
+  load(model, data, worlds, 0, (0, 0, -0.1))
+  run(model, data, worlds, 60, lambda k: 0.01 * min(1.0, k / 30))
+  tension = worlds.thread("t").tension.numpy()
+  np.testing.assert_allclose(tension[:, -1] / tension[:, 0], np.exp(0.3 * np.pi), rtol=0.03)
+  assert off(thread, worlds) < 2e-5  # it has slid by 0.45 mm
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_a_thread_over_an_organ_is_borne_by_it(device):
   """Its weight and two loads are the organ's contact force.
 
@@ -126,6 +137,72 @@ def test_a_held_thread_does_not_meet_the_jaws_that_it_is_in(device):
   held = worlds.thread("t").xpos.numpy()[:, 20] - thread.positions[20]
   assert np.abs(held).max() < 1e-5
   assert worlds.thread("t").tension.numpy().max() < 0.1
+
+
+@pytest.mark.parametrize("device", ["cpu", *DEVICES])
+def test_each_world_holds_the_thread_where_it_says(device):
+  """A hand takes it at another node in each world, one at none, and lets go of it, as in one."""
+  nodes, anchor, text = np.array([20, 12, -1, 25]), (0.0, 0.0005, 0.0), one.hand(held=False)
+  alone = [one.loaded(text) for _ in nodes]
+  worlds = palpate.batch.make(mujoco.MjSpec.from_string(text), len(nodes), device)
+  # In the plane of the jaws' faces a loose hold keeps the thread from meeting these.
+  for firm, which, steps in ((True, nodes, 40), (False, nodes, 10), (True, 0 * nodes - 1, 20)):
+    given = which, np.tile(anchor, (len(nodes), 1)), np.full(len(nodes), firm)
+    worlds.thread("t").hold("grip", *given)
+    for (_, _, thread), *each in zip(alone, *given, strict=True):
+      thread.hold("grip", *each)
+    for k in range(steps):
+      ctrl = 3.0 * np.sign(np.sin(0.1 * k)), 0.0, 0.0
+      worlds.ctrl = np.tile(ctrl, (len(nodes), 1))
+      worlds.step()
+      for model, data, _ in alone:
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data)
+    places = [thread.positions for _, _, thread in alone]
+    np.testing.assert_allclose(worlds.thread("t").xpos.numpy(), places, atol=1e-5)
+    if firm and which is nodes:  # it went along with the hand
+      hands = np.array([data.qpos[0] for _, data, _ in alone])
+      off = np.array(places)[range(len(nodes)), nodes, 1] - hands
+      np.testing.assert_allclose(off[nodes >= 0], anchor[1], atol=2e-5)
+      assert np.abs(hands).min() > 4e-4
+  assert np.ptp([place[20, 1] for place in places]) > 1e-3
+  worlds.thread("t").hold("grip", *given)
+  worlds.reset()
+  worlds.step(10)
+  assert np.abs(worlds.thread("t").xpos.numpy()[:, :, 1]).max() < 1e-6
+
+
+@pytest.mark.parametrize("device", ["cpu", *DEVICES])
+def test_worlds_begin_with_a_thread_that_is_laid(device):
+  """One along an arc, from which it springs back as in one world; the other one stays."""
+  text = one.document(one.line(21, 0.04), option=one.FREE, bend=1.0, drag=1e-3)
+  model, data, thread, worlds = scene(text, device)
+  angle = np.linspace(0.0, 1.5, 200)
+  thread.lay(0.03 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1))
+  places = np.stack([thread.positions, 0 * thread.positions])
+  worlds.thread("t").lay(places, np.array([True, False]))
+  mujoco.mj_step(model, data, 20)
+  worlds.step(20)
+  found = worlds.thread("t").xpos.numpy()
+  np.testing.assert_allclose(found[0], thread.positions, atol=1e-6)
+  assert np.abs(thread.positions - places[0]).max() > 1e-4
+  np.testing.assert_allclose(found[1], one.line(21, 0.04), atol=1e-7)
+
+
+def test_what_cannot_hold_a_thread_is_named():
+  given = np.zeros(2, int), np.zeros((2, 3)), np.ones(2, bool)
+  for held, names in ((True, "none"), (False, "'grip'")):
+    text = one.hand(held=held)
+    worlds = palpate.batch.make(mujoco.MjSpec.from_string(text), 2, "cpu")
+    what = f"'nail' does not hold it, .*; the scene has {names}"
+    with pytest.raises(ValueError, match=what):
+      worlds.thread("t").hold("nail", *given)
+    with pytest.raises(ValueError, match=what):
+      one.loaded(text)[2].hold("nail", 0)
+  with pytest.raises(ValueError, match=r"node is 41, expected one in \[-1, 41\)"):
+    one.loaded(text)[2].hold("grip", 41)
+  with pytest.raises(ValueError, match=r"anchor has shape \(2,\), expected \(2, 3\)"):
+    worlds.thread("t").hold("grip", given[0], given[0], given[2])
 
 
 @pytest.mark.parametrize("device", DEVICES)

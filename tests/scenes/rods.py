@@ -55,9 +55,9 @@ def force(model, data, node, value):
 FREE = 'gravity="0 0 0"'
 
 
-def drum(friction, cone, kind="cylinder", h=1e-3):
+def drum(friction, cone, kind="cylinder", h=1e-3, radius=0.01):
   """Returns a thread half around a drum, its left end to be loaded, its right end on a slide."""
-  radius, tail, n = 0.01, 0.03, 81
+  tail, n = 3 * radius, 81
   r = radius + RADIUS
   s = np.linspace(0, np.pi * r + 2 * tail, n)
   angle = np.clip(np.pi - (s - tail) / r, 0, np.pi)
@@ -84,8 +84,8 @@ def needle(mass, n=41):
   return document(line(n, 0.08), pin=(0,), world=world, after=after, bend=0.02)
 
 
-def hand(n=41):
-  """Returns jaws that close on a thread in the middle, where an equality holds it."""
+def hand(n=41, held=True):
+  """Returns jaws that close on a thread in the middle, where an equality `grip` holds it or may."""
   jaws = "".join(
     f"""<body pos="0 0 {-way * 0.0014}"><joint name="jaw{k}" type="slide" axis="0 0 {way}"
       damping="2"/><geom type="box" size="0.002 0.002 0.001" mass="0.02" friction="0.2"
@@ -95,8 +95,8 @@ def hand(n=41):
   world = f"""<body name="hand" pos="0.01 0 0"><joint name="hand" type="slide" axis="0 1 0"
     damping="5"/><geom size="0.001" mass="0.2" contype="0" conaffinity="0"/>{jaws}</body>"""
   motors = "".join(f'<motor joint="{name}"/>' for name in ("hand", "jaw0", "jaw1"))
-  ties = f"""<equality><connect body1="hand" body2="t_{n // 2}" anchor="0 0 0"
-    solref="0.002 1"/></equality>"""
+  ties = f"""<equality><connect name="grip" body1="hand" body2="t_{n // 2}" anchor="0 0 0"
+    solref="0.002 1" active="{str(held).lower()}"/></equality>"""
   option = f'{FREE} cone="elliptic" impratio="10"'
   after = f"<actuator>{motors}</actuator>{ties}"
   return document(line(n, 0.02), option=option, world=world, after=after, bend=0.02)

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from .private import instead, uninterpolated
+from .private import instead, of_threads
 
 _BLOCK = 256  # threads of a block on CUDA where a launch does not say
 # Told to who asks how many threads and blocks fill a device: to find out, Warp compiles the kernel.
@@ -43,6 +43,6 @@ def compile_ahead(device: wp.Device, works: Iterable[Callable[[], Any]]):
     for work in works:
       work()
   # One pool: `force_load` has one for each size of blocks, and waits for its slowest module.
-  with uninterpolated(), ThreadPoolExecutor(os.cpu_count()) as pool:
+  with of_threads(), ThreadPoolExecutor(os.cpu_count()) as pool:
     for job in [pool.submit(wp.force_load, device, [each], size, 0) for each, size in found]:
       job.result()

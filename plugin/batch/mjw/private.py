@@ -37,10 +37,28 @@ from mujoco_warp._src.types import (
 )
 
 __all__ = [
-  "MJ_MAX_EPAFACES", "MJ_MAX_EPAHORIZON", "ConstraintState", "ConstraintType", "ContactType",
-  "DeterminismType", "Geom", "GeomType", "OverflowType", "box_triangle", "capsule_triangle", "ccd",
-  "contact_kbimp", "instead", "jac_dof", "passive", "ray_geom", "sensor", "solver",
-  "sphere_triangle", "uninterpolated", "vec5",
+  "MJ_MAX_EPAFACES",
+  "MJ_MAX_EPAHORIZON",
+  "ConstraintState",
+  "ConstraintType",
+  "ContactType",
+  "DeterminismType",
+  "Geom",
+  "GeomType",
+  "OverflowType",
+  "box_triangle",
+  "capsule_triangle",
+  "ccd",
+  "contact_kbimp",
+  "instead",
+  "jac_dof",
+  "of_threads",
+  "passive",
+  "ray_geom",
+  "sensor",
+  "solver",
+  "sphere_triangle",
+  "vec5",
 ]  # fmt: skip
 
 # Large functions with many callers: inlined, they made kernels of contacts with flexes, of which we
@@ -68,7 +86,7 @@ def instead(changes: list[tuple[Any, str, Any]]) -> Iterator[None]:
       setattr(*change)
 
 
-_kernels: dict[Any, Any] = {}  # those made within `uninterpolated`
+_kernels: dict[Any, Any] = {}  # those made within `of_threads`
 
 
 @wp.func
@@ -76,15 +94,19 @@ def _add_none(nb: int, body: Any, weight: Any, b: int, w: float):
   return nb, body, weight
 
 
-def uninterpolated() -> contextlib.AbstractContextManager[None]:
-  """Lets mujoco_warp make and compile kernels within that know no interpolated flexes.
+def of_threads() -> contextlib.AbstractContextManager[None]:
+  """Lets mujoco_warp find contacts with flexes within as threads need them.
 
-  Each thread of its kernels of contacts with flexes has lists of 64 nodes for them, in slow memory,
-  which it fills whether there are any or not. Slots and threads are never interpolated. Without the
-  lists the Jacobian of contacts takes 0.4 times as long. Kernels that others have of mujoco_warp
-  stay as they are.
+  All of them count: of those with a geom that are less than 1 mm from a deeper one it keeps none,
+  and a thread whose edges are shorter would hang over an instrument on a single one.
+
+  Its kernels know no interpolated flexes. Each thread of those of contacts with flexes has lists of
+  64 nodes for them, in slow memory, which it fills whether there are any or not. Slots and threads
+  are never interpolated. Without the lists the Jacobian of contacts takes 0.4 times as long.
+  Kernels that others have of mujoco_warp stay as they are.
   """
   return instead([
     (warp_util, "_KERNEL_CACHE", _kernels),
     (support, "add_interp_weight", _add_none),
+    (collision_flex, "_FLEX_CONTACT_DEDUP_TOLERANCE", 0.0),
   ])  # fmt: skip

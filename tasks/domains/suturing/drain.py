@@ -148,6 +148,12 @@ def sew(organ: palpate.Organ, line: np.ndarray) -> palpate.Thread:
   return thread
 
 
+def beside(nodes: int) -> np.ndarray:
+  """Returns vertices of both lips beside the stitch, right and left, see `drain`  (n, 2)."""
+  rest, _, lips = drain(nodes)
+  return lips[np.abs(rest[lips[:, 0], 1]) < 0.25 * SLIT]
+
+
 def gap(places: np.ndarray, nodes: int) -> float:
   """Returns how far the slit gapes at most beside the stitch, 0 where its lips overlap [m].
 
@@ -155,8 +161,7 @@ def gap(places: np.ndarray, nodes: int) -> float:
     places: of the drain's vertices now [m]  (nvert, 3)
     nodes: that it was made with, see `drain`
   """
-  rest, _, lips = drain(nodes)
-  right, left = lips[np.abs(rest[lips[:, 0], 1]) < 0.25 * SLIT].T
+  right, left = beside(nodes).T
   return float((places[right, 0] - places[left, 0]).max(initial=0.0))
 
 

@@ -11,35 +11,59 @@ Jaws that press on the thread hold it: an equality joins them to the node that i
 Threads meet the jaws as round, smooth bodies, on which a loop slides off: the inserts, whose
 friction holds a thread, have corners.
 
-Own observations, in the world: `short` (3,) and `long` (3,), from the right tip to the ends of both
-tails [m]; `stitch` (3,), from there to the middle of the stitch [m]; `gap` (1,), of the slit [m];
-`tension` (1,), the largest of the thread [N]; `tied` (1,), whether the thread has the throw;
-`right_holds` (1,), `left_holds` (1,), whether a hand holds the thread.
+Own observations, in the world: `short_tail` (3,) and `long_tail` (3,), from the right tip to the
+ends of both tails [m]; `stitch` (3,), from there to the middle of the stitch [m]; `gap` (1,), of
+the slit [m]; `tension` (1,), the largest of the thread [N]; `tied` (1,), whether the thread has the
+throw; `right_holds` (1,), `left_holds` (1,), whether a hand holds the thread.
 
 Success: the thread has the throw, see `palpate.tasks.metrics.knots`, and the slit is closed to
 1 mm, for 0.3 s. Progress: 0.9 * closing of a throw that is tied, closing from 0.5 to 1 by the gap.
 Failure: a thread that breaks or tears out of the drain, a force above the damage limit, or the time
 limit.
-
-It has no vectorised form: a batch cannot lay a thread and sew it while it runs.
 """
 
 import math
 from collections.abc import Callable, Mapping
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
+import palpate
+import warp as wp
+from palpate.engine.model.flexes import matrix
 from palpate.models import wrist
+from palpate.tissue.types import Array, ints
 
 from ...core.base import Physics
-from ...core.instrument import Instrument
 from ...core.performer import Performer, Script
-from ...core.rules import clamp
+from ...core.rules import (
+  DAMAGED,
+  FAR,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  clamp,
+  hold,
+  in_hand,
+  jaws,
+  many,
+  pierced,
+  reach,
+  snapped,
+  strand,
+  strands,
+  taut,
+  throw,
+  tip,
+  vector,
+  vertex,
+)
 from ...core.scenes import Scene
-from ...metrics import knots
+from ...core.stage import STATE, Stage
 from ...registry import exercise
 from . import drain
-from .drain import CLOSED, EDGE, HANDS, MIDDLE, PULL, STAYS
+from .drain import CLOSED, EDGE, GAPE, HANDS, MIDDLE, PULL, STAYS
 from .needles import between
 
 FIELD = Scene(
@@ -58,11 +82,9 @@ _SOLVED = 1e-12
 # clevis [m]; steel is smooth.
 _ROUND, _CLEVIS, _JAW, _LINK, _STEEL = 0.001, 0.0026, 0.0102, 0.0091, (0.1, 0.005, 0.0001)
 # Jaws that press hold a thread: closer than so [rad], as far from the middle of what is between
-# them, which is so far from the tip [m].
-_SHUT, _WITHIN, _PADS = 0.08, np.array([0.0004, 0.0009, 0.0026]), 0.0036
-# Time constant, damping ratio and impedance of what holds it; as they open stiffness, damping and
-# impedance, of none to speak of.
-_FIRM, _LOOSE = (0.004, 1.0, 0.9), (-1e-10, -1e-10, 1e-4)
+# them along each axis, which is so far from the tip [m].
+_SHUT, _ACROSS_IT, _BESIDE_IT, _ALONG_IT, _PADS = 0.08, 0.0004, 0.0009, 0.0026, 0.0036
+_HIGH = float(MIDDLE[2])  # of the stitch [m]
 _LOOKS = 10  # control steps after which the knot is looked at
 # Of the expert. Where the thread is from the tip of jaws that hold it [m], actions of open jaws and
 # of those that hold.
@@ -96,14 +118,166 @@ def standard(**kwargs):
   return Knot(FIELD, **{"turns": 2, **kwargs})
 
 
+class State:
+  """State of a world."""
+
+  control_timestep: float  # [s]
+  turns: int
+  lips: Annotated[Any, ints("pairs", 2)]  # vertices of both lips beside the stitch
+  held: Annotated[Any, ints(2)]  # node that each hand holds, or held until it opens; -1 for none
+  firm: Annotated[Any, ints(2)]  # whether it holds it
+  anchors: Annotated[Any, Array(wp.vec3, (2,))]  # where in the frame of its tip [m]
+  looked: int
+  stayed: float  # how long the throw has been down [s]
+  whole: bool  # whether the thread is in both of its holes
+  broken: bool  # whether it is broken
+  gap: float
+  tension: float
+  hardest: float  # largest pull on the drain so far [N]
+  tightest: float  # largest tension so far [N]
+  short_tail: Vector
+  long_tail: Vector
+  stitch: Vector
+  tied: float
+  right_holds: float
+  left_holds: float
+
+
+# The rules.
+
+
+def around(s, hand):
+  """Returns the node nearest to the middle between a hand's jaws, and how far off it is [-].
+
+  1 is as far as a node may be that they hold.
+  """
+  instrument = s.hands[hand]
+  local = (s.thread.positions - instrument.tip_pos()) @ matrix(instrument.tip_quat())
+  off = np.abs(local - _PADS * Z) / (_ACROSS_IT, _BESIDE_IT, _ALONG_IT)
+  node = int(off.max(axis=1).argmin())
+  return node, float(off[node].max())
+
+
+@many(around)
+def around_each(s, hand):
+  """Returns the same."""
+  node = int(0)
+  least = float(FAR)
+  for k in range(strands(s)):
+    local = in_hand(s, hand, strand(s, k))
+    off = max(abs(local[0]) / _ACROSS_IT, abs(local[1]) / _BESIDE_IT)
+    off = max(off, abs(local[2] - _PADS) / _ALONG_IT)
+    if off < least:
+      node = k
+      least = off
+  return node, least
+
+
+def follow_jaws(s, o, hand):
+  """Lets jaws that press hold the node that they are around, and let go of it where they do not.
+
+  The node stays theirs until they are open, without a force: the thread does not meet them till
+  then, as it is in them.
+  """
+  opening, target = jaws(s, hand)
+  if opening > _SHUT:
+    o.held[hand] = -1
+    o.firm[hand] = 0
+    hold(s, hand, -1, o.anchors[hand], False)
+  elif target > 0.0:
+    o.firm[hand] = 0
+    hold(s, hand, o.held[hand], o.anchors[hand], False)
+  elif o.firm[hand] == 0:
+    node, off = around(s, hand)
+    if off <= 1.0:
+      o.held[hand] = node
+      o.firm[hand] = 1
+      o.anchors[hand] = in_hand(s, hand, strand(s, node))
+      hold(s, hand, node, o.anchors[hand], True)
+  return o
+
+
+def begin(s, o):
+  """Lets the hands hold what their closed jaws are around."""
+  for hand in range(2):
+    hold(s, hand, -1, o.anchors[hand], False)
+    o = follow_jaws(s, o, hand)
+  return o
+
+
+def follow(s, o):
+  """Finds what jaws hold, the gap, the tension, and now and then the throw."""
+  for hand in range(2):
+    o = follow_jaws(s, o, hand)
+  count, pull = pierced(s)
+  o.whole = count == 2
+  o.broken = snapped(s)
+  o.tension = taut(s)
+  o.hardest = max(o.hardest, pull)
+  o.tightest = max(o.tightest, o.tension)
+  o.gap = 0.0
+  for k in range(o.lips.shape[0]):
+    o.gap = max(o.gap, float(vertex(s, o.lips[k, 0])[0] - vertex(s, o.lips[k, 1])[0]))
+  o.looked = o.looked + 1
+  if o.looked % _LOOKS == 0:
+    found = throw(s)
+    if found >= 0:
+      o.tied = 1.0 if found == o.turns else 0.0
+  return o
+
+
+def judge(s, o):
+  """Returns the progress of the throw; see the module's head."""
+  if o.broken or not o.whole:
+    return o, -1.0, DAMAGED
+  o.stayed = o.stayed + o.control_timestep if o.tied > 0.0 and o.gap < CLOSED else 0.0
+  closing = clamp((GAPE - o.gap) / (GAPE - CLOSED), 0.0, 1.0)
+  progress = 0.45 * (1.0 + closing) if o.tied > 0.0 else 0.0
+  if o.stayed > STAYS - 1e-6:
+    reach(s, o, o.gap)
+    return o, progress, SUCCESS
+  return o, progress, RUNNING
+
+
+def advance(s, o):
+  """Follows the throw."""
+  return judge(s, follow(s, o))
+
+
+def see_tails(s, o):
+  """Finds where the tails are, and the stitch."""
+  o.short_tail = strand(s, strands(s) - 1) - tip(s)
+  o.long_tail = strand(s, 0) - tip(s)
+  o.stitch = vector(0.0, 0.0, _HIGH) - tip(s)
+  return o
+
+
+def observe(s, o):
+  """Finds where the tails are, and who holds one."""
+  o = see_tails(s, o)
+  o.right_holds = float(o.firm[0])
+  o.left_holds = float(o.firm[1])
+  return o
+
+
 class Knot(drain.Sewn):
   """Tie a throw with two needle drivers.
 
   Attributes:
     turns: how often the strands wind about each other
     tied: whether they do
-    holds: what each hand holds
+    held, firm: what each hand holds, see `State`
   """
+
+  rules: Any = Rules(
+    State,
+    advance,
+    observe,
+    ("short_tail", "long_tail", "stitch", "gap", "tension", "tied", "right_holds", "left_holds"),
+    metrics={"peak_traction": "hardest", "final_gap": "gap", "peak_tension": "tightest"},
+    begin=begin,
+    shared=("lips",),
+  )
 
   def __init__(self, scene: Scene, random=None, *, turns: int, **kwargs):
     """Makes the task.
@@ -117,6 +291,8 @@ class Knot(drain.Sewn):
     self.turns, self.lean, self.aside = turns, _LEAN, _ASIDE
     # Jaws that close strike each other, and what they take, with 9 to 20 N in single steps.
     super().__init__(scene, random, **{"force_limit": 30.0, "damage": 60.0, **kwargs})
+    self.lips = drain.beside(self.scene.nodes)
+    self.pairs = len(self.lips)
 
   def line(self) -> np.ndarray:
     """Returns the line of the thread, from the end of its long tail  (4, 3)."""
@@ -129,6 +305,7 @@ class Knot(drain.Sewn):
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: the drain, its thread, round jaws, and what joins a node to each hand."""
+    self.lean, self.aside = _LEAN, _ASIDE  # whatever the last episode has drawn
     line = self.line()
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
     at = EDGE * np.arange(int(along[-1] / EDGE) + 1)
@@ -140,8 +317,9 @@ class Knot(drain.Sewn):
         _rounded(spec.body(prefix + name), _ROUND, (x, 0.0, -_ROUND), _JAW - _ROUND)
       _rounded(spec.body(f"{prefix}tip"), _CLEVIS, (0.0, 0.0, 0.0), _LINK)
       spec.add_equality(
-        name=f"{prefix}thread", type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY,
-        name1=f"{prefix}gripper", name2=f"{drain.THREAD}_0", active=False, solref=[0.004, 1],
+        name=f"{prefix}{drain.THREAD}", type=mujoco.mjtEq.mjEQ_CONNECT,
+        objtype=mujoco.mjtObj.mjOBJ_BODY, name1=f"{prefix}gripper", name2=f"{drain.THREAD}_0",
+        active=False,
       )  # fmt: skip
     return spec
 
@@ -149,74 +327,53 @@ class Knot(drain.Sewn):
     """Returns the drain and a thread with these nodes, see `drain.build`."""
     return drain.build(self._scene(variant), nodes)
 
+  def _stage(self, spec: mujoco.MjSpec) -> Stage:
+    """Returns the stage: the thread is sewn."""
+    made = super()._stage(spec)
+    data = mujoco.MjData(made.model)
+    mujoco.mj_setState(made.model, data, made.state, STATE)
+    mujoco.mj_forward(made.model, data)
+    drain.sew(palpate.Organ(made.model, data, self.organ), self.line())
+    mujoco.mj_getState(made.model, data, made.state, STATE)
+    return made
+
   def begin(self, physics: Physics) -> None:
     """Draws how the tails lie and where the left hand is; the right one holds the long tail."""
     super().begin(physics)
     self.lean = _LEAN + self.random.uniform(-0.15, 0.15, 3)
     self.aside = _ASIDE + self.random.uniform(-1.0, 1.0, 3) * _OFF
-    self.holds = [Hold(physics, hand) for hand in physics.hands]
-    self.tied, self.looked, self.stayed = False, 0, 0.0
+    self.held, self.firm, self.anchors = np.full(2, -1), np.zeros(2, int), np.zeros((2, 3))
+    self.looked, self.whole, self.broken = 0, True, False
+    self.tied = self.stayed = self.hardest = self.tightest = 0.0
+    self.right_holds = self.left_holds = 0.0
+    self.short_tail, self.long_tail, self.stitch = np.zeros((3, 3))
     self.place(physics)
 
   def place(self, physics: Physics) -> None:
-    """Sews the thread, and puts the hands to it."""
+    """Lays the thread, and puts the hands to it."""
     line = self.line()
-    places = drain.sew(physics.organ, line).positions
+    thread = physics.thread
+    assert thread
+    thread.lay(line)
+    self.threads = {thread.name: thread.positions}
     way = line[0] - line[1]
     held = line[1] + LONG[self.turns] * way / np.linalg.norm(way)
     _, left = physics.hands
     # Its roll is where it can be turned on from.
     near = -math.pi
     physics.set_joints(wrist.inverse(physics.trocar(), held - _GRIP * X, _facing(1, _START), near))
-    tip = _LEFT + self.random.uniform(-0.004, 0.004, 3)
-    left.set_joints(wrist.inverse(left.trocar(), tip, _flat(-1)))
-    self.holds[0].take(places)
+    place = _LEFT + self.random.uniform(-0.004, 0.004, 3)
+    left.set_joints(wrist.inverse(left.trocar(), place, _flat(-1)))
 
   def still(self, hand: int) -> np.ndarray:
     """Returns what keeps the jaws closed."""
     return np.array([HOLD])
 
-  def look(self, physics: Physics) -> None:
-    """Finds what jaws hold, and now and then the throw."""
-    super().look(physics)
-    assert physics.thread
-    places = physics.thread.positions
-    for hold in self.holds:
-      hold.follow(places)
-    self.looked += 1
-    if self.looked % _LOOKS == 0:
-      found = knots.throws(knots.closed(places), 1)
-      self.tied = self.tied if found is None else [abs(k) for k in found] == [self.turns]
-
-  def advance(self, physics: Physics) -> float:
-    """Follows the throw; see the module's head."""
-    self.look(physics)
-    if self.lost(physics):
-      return -1.0
-    down = self.tied and self.gap < CLOSED
-    self.stayed = self.stayed + self.control_timestep if down else 0.0
-    if self.stayed > STAYS - 1e-6:
-      self.event(physics, "target", self.gap, "throw")
-      self.outcome = "success"
-      return 1.0
-    closing = clamp((drain.GAPE - self.gap) / (drain.GAPE - CLOSED), 0.0, 1.0)
-    return 0.45 * (1.0 + closing) if self.tied else 0.0
-
-  def observe(self, physics: Physics) -> Mapping[str, np.ndarray]:
-    """Returns where the tails are, and whether the throw is tied."""
-    assert physics.thread
-    places, tip = physics.thread.positions, physics.tip_pos()
-    right, left = (np.array([float(hold.holds)]) for hold in self.holds)
-    return {
-      "short": places[-1] - tip,
-      "long": places[0] - tip,
-      "stitch": MIDDLE - tip,
-      "gap": np.array([self.gap]),
-      "tension": np.array([self.tension]),
-      "tied": np.array([float(self.tied)]),
-      "right_holds": right,
-      "left_holds": left,
-    }
+  def label(self, kind: str) -> str:
+    """Returns what an event of the rules is called."""
+    if kind == "damage":
+      return "thread broken" if self.broken else "torn out of the drain"
+    return "throw" if kind == "target" else super().label(kind)
 
   def show(self, physics: Physics) -> None:
     """Marks nothing."""
@@ -226,7 +383,7 @@ class Knot(drain.Sewn):
     """Says what is next."""
     if self.tied:
       return "Draw both tails apart until the slit is closed"
-    if not any(hold.holds for hold in self.holds):
+    if not any(self.firm):
       return "Take the long tail"
     times = ("once", "twice")[self.turns - 1]
     return (
@@ -241,63 +398,6 @@ class Knot(drain.Sewn):
     yield from tie.wind(1, self.turns)
     yield from tie.draw(1)
     yield from tie.tighten(1)
-
-
-class Hold:
-  """What a hand's jaws hold of the thread: a node that an equality joins to them.
-
-  Attributes:
-    node: that they hold, or held until they are open; -1 for none
-  """
-
-  def __init__(self, physics: Physics, hand: Instrument):
-    """Looks after a hand."""
-    self.hand, self.node = hand, -1
-    model = physics.model.ptr
-    self._equality = model.equality(f"{hand.prefix}thread").id
-    self._gripper = model.body(f"{hand.prefix}gripper").id
-    self._first = model.body(f"{drain.THREAD}_0").id
-
-  @property
-  def holds(self) -> bool:
-    """Whether they hold it."""
-    return self.node >= 0 and bool(self.hand.model.ptr.eq_solref[self._equality, 0] > 0.0)
-
-  def press(self, first: float, second: float, impedance: float) -> None:
-    """Sets solref and impedance of the equality."""
-    model = self.hand.model.ptr
-    model.eq_solref[self._equality] = first, second
-    model.eq_solimp[self._equality, :2] = impedance
-
-  def take(self, places: np.ndarray) -> None:
-    """Takes the node nearest to the middle between the jaws, if one is between them."""
-    model, data = self.hand.model.ptr, self.hand.data.ptr
-    frame = data.xmat[self._gripper].reshape(3, 3)
-    local = (places - data.xpos[self._gripper]) @ frame
-    off = np.abs(local + (_JAW - _PADS) * Z) / _WITHIN
-    node = int(off.max(axis=1).argmin())
-    if off[node].max() > 1.0:
-      return
-    self.node = node
-    model.eq_obj2id[self._equality] = self._first + node
-    model.eq_data[self._equality, :6] = *local[node], 0.0, 0.0, 0.0
-    self.press(*_FIRM)
-    data.eq_active[self._equality] = 1
-
-  def follow(self, places: np.ndarray) -> None:
-    """Takes what jaws that press are around, and lets go of it where they do not.
-
-    The equality stays until they are open, without a force: the thread does not meet them till
-    then, as it is in them.
-    """
-    opening, target = self.hand.gripper()[:2]
-    if opening > _SHUT:
-      self.node = -1
-      self.hand.data.ptr.eq_active[self._equality] = 0
-    elif target > 0.0:
-      self.press(*_LOOSE)
-    elif not self.holds:
-      self.take(places)
 
 
 def _rounded(body: mujoco.MjsBody, radius: float, start: tuple, far: float) -> None:
@@ -345,8 +445,8 @@ class Tie:
 
   def held(self, side: int) -> int:
     """Returns the node that a hand holds."""
-    hold = self.task.holds[(1 - side) // 2]
-    return hold.node if hold.holds else -1
+    hand = (1 - side) // 2
+    return int(self.task.held[hand]) if self.task.firm[hand] else -1
 
   def pull(self, side: int) -> float:
     """Returns the tension of the strand that a hand holds, as it feels it [N]."""

@@ -21,11 +21,12 @@ share of the needle that is through both; 0.3 once that is through, 0.4 once it 
 `knot`. Failure: a hole farther from its mark, a needle that nobody holds for half a second while it
 is on its thread, and what fails in `knot`.
 
-It has no vectorised form: a batch's jaws do not hold a thread.
+It has no vectorised form: its rules look at the thread beside the needle, and take the needle off.
 """
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -34,10 +35,21 @@ from palpate.models import wrist
 
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.rules import clamp, closeness, needle_place, pierced, pinhole, torn_at
+from ...core.rules import (
+  DAMAGED,
+  OUTCOMES,
+  SUCCESS,
+  clamp,
+  closeness,
+  needle_place,
+  pierced,
+  pinhole,
+  torn_at,
+)
 from ...core.scenes import Scene
+from ...core.stage import Stage
 from ...registry import exercise
-from . import drain
+from . import drain, knot
 from .knot import BEYOND, HOLD, Knot, Tie
 from .needles import (
   LEFT,
@@ -112,6 +124,7 @@ class Stitch(Knot, Stitching):
     attached: whether it is on its thread
   """
 
+  rules = None
   targets = 2
 
   def __init__(self, scene: Scene, random=None, *, turns: int, tolerance: float, **kwargs):
@@ -139,6 +152,14 @@ class Stitch(Knot, Stitching):
     self.meet(spec, _MEETS)
     return spec
 
+  def label(self, kind: str) -> str:
+    """Returns what an event of the rules is called: holes come before the throw."""
+    return "hole" if kind == "target" and self.holes < 2 else super().label(kind)
+
+  def _stage(self, spec: mujoco.MjSpec) -> Stage:
+    """Returns the stage, whose thread is not sewn."""
+    return super(Knot, self)._stage(spec)
+
   def place(self, physics: Physics) -> None:
     """Puts the needle into the right hand's jaws, its thread away from both."""
     pos, mat = piercing(self.marks, -half_angle(self.marks) - _BEFORE)
@@ -163,7 +184,7 @@ class Stitch(Knot, Stitching):
 
   def look(self, physics: Physics) -> None:
     """Follows needle and thread through the tube, and who holds what."""
-    super().look(physics)
+    knot.follow(physics, self)
     count, _ = pierced(physics)
     self.torn = max([self.torn, *(torn_at(physics, k) for k in range(count))])
     _, self.worst = open_holes(physics, self, min(count, 2))
@@ -187,7 +208,12 @@ class Stitch(Knot, Stitching):
 
   def advance(self, physics: Physics) -> float:
     """Follows the stitch; see the module's head."""
-    progress = super().advance(physics)
+    self.look(physics)
+    _, progress, outcome = knot.judge(physics, self)
+    self.outcome = OUTCOMES[outcome]
+    if outcome == DAMAGED:
+      self.event(physics, "note", label=self.label("damage"))
+    progress = 1.0 if outcome == SUCCESS else progress
     dropped = self.attached and self.loose > LOST
     if self.outcome is None and (dropped or self.worst > self.tolerance):
       self.outcome = "missed"
@@ -206,11 +232,14 @@ class Stitch(Knot, Stitching):
   def observe(self, physics: Physics) -> Mapping[str, np.ndarray]:
     """Returns where needle and tails are."""
     middle, end = (needle_place(physics, at) for at in (np.zeros(3), np.array([0.0, 0.0, 1.0])))
-    seen = super().observe(physics)
+    seen: Any = knot.see_tails(physics, self)
     holds = {"right_holds": self.right_holds, "left_holds": self.left_holds}
     return {
-      **seen,
-      **{name: np.maximum(seen[name], self.attached * needle) for name, needle in holds.items()},
+      **{name: np.array(getattr(seen, name), float, ndmin=1) for name in Knot.rules.observed},
+      **{
+        name: np.maximum(float(firm), self.attached * np.array([needle]))
+        for (name, needle), firm in zip(holds.items(), self.firm, strict=True)
+      },
       "target": self.marks[min(self.holes, 1)] - arc(physics, 1.0),
       "circle": end - middle,
       "needle": middle - physics.tip_pos(),
@@ -233,7 +262,7 @@ class Stitch(Knot, Stitching):
     if not self.attached:
       return super().instruct(physics)
     if self.placed:
-      if self.holds[0].holds:
+      if self.firm[0]:
         return "Pull the needle off its thread"
       return "Draw the thread up until 2 cm are left, and take it 1 cm below the needle"
     return (
