@@ -99,7 +99,8 @@ def compare_metrics(told, k, expected):
     ("needle/transfer_easy", 1, 90, {}),
     ("suture/drive_easy", 1, 42, {}),  # through the first mark
     pytest.param("suture/drive_easy", 1, 128, {}, marks=pytest.mark.slow),
-    pytest.param("suture/running_easy", 1, 50, {}, marks=pytest.mark.slow),
+    # Rounding decides in which of five steps it pierces the mark that it presses on then.
+    pytest.param("suture/running_easy", 1, 47, {}, marks=pytest.mark.slow),
   ],
 )
 def test_each_world_is_the_single_environment_of_its_seed(task, count, steps, options):
