@@ -64,6 +64,7 @@ class Rules:
   observe: Callable
   observed: tuple[str, ...]
   metrics: Mapping[str, str] = dataclasses.field(default_factory=dict)
+  _: dataclasses.KW_ONLY
   begin: Callable | None = None
   act: Callable | None = None
   shared: tuple[str, ...] = ()

@@ -231,7 +231,7 @@ class Bimanual(Dissect):
     observe,
     (*Dissect.rules.observed, "hook_front", "hook_gap", "retracted", "burnt"),
     METRICS | {"current_time": "powered", "current_wasted": "wasted"},
-    act,
+    act=act,
     mark=Dissect.rules.mark,
   )
   slots = 36
