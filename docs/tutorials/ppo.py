@@ -16,7 +16,7 @@ import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 
 DISCOUNT, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.95, 0.95, 0.2, 5, 4  # see docs/training.md
-KL, ENTROPY, NOISE = 0.02, 0.001, 0.4  # change of the policy aimed at, in a minibatch
+KL, ENTROPY, NOISE = 0.02, 0.004, 0.4  # change of the policy aimed at, in a minibatch
 STEPS, SCALE = 8, 10.0  # decisions of an iteration; of rewards, which add up to that
 FINE, LEFT = 0.005, 0.05  # the last of the way [m] and of the progress have scales of their own
 REPEAT, PACE = 2, 0.4  # control steps of a decision, and share of the rates that it uses
@@ -27,23 +27,24 @@ ENOUGH = 0.9  # success without noise that ends the training
 
 
 class Agent(nn.Module):
-  """A policy with noise of its own for each component, and a critic."""
+  """A policy whose noise depends on what it sees, as its actions do, and a critic."""
 
   def __init__(self, nseen: int, naction: int):
     """Makes the networks, the policy's with actions near 0."""
     super().__init__()
     self.normal = nn.BatchNorm1d(nseen, eps=1e-6, momentum=None, affine=False)
-    self.mean, self.value = (
+    self.policy, self.value = (
       nn.Sequential(nn.Linear(nseen, 256), nn.ELU(), nn.Linear(256, 128), nn.ELU(), last)
-      for last in (nn.Linear(128, naction), nn.Linear(128, 1))
+      for last in (nn.Linear(128, 2 * naction), nn.Linear(128, 1))
     )
-    nn.init.normal_(self.mean[-1].weight, std=1e-3)
-    self.noise = nn.Parameter(torch.full((naction,), NOISE).log())
+    nn.init.normal_(self.policy[-1].weight, std=1e-3)
 
   def forward(self, rows: torch.Tensor) -> tuple[torch.distributions.Normal, torch.Tensor]:
     """Returns how actions are distributed, and the values."""
     normal = self.normal(rows).clamp(-5, 5)
-    return torch.distributions.Normal(self.mean(normal), self.noise.exp()), self.value(normal)[:, 0]
+    mean, noise = self.policy(normal).chunk(2, 1)
+    noise = NOISE * noise.clamp(-1, 0.7).exp()
+    return torch.distributions.Normal(mean, noise, validate_args=False), self.value(normal)[:, 0]
 
 
 def look(seen: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -80,10 +81,10 @@ def update(agent: Agent, adam: torch.optim.Adam, data: list[torch.Tensor]) -> No
       policy, guess = agent(seen)
       ratio = (policy.log_prob(action).sum(1) - before).exp()
       advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
-      gain = torch.min(ratio * advantage, ratio.clamp(1 - CLIP, 1 + CLIP) * advantage).mean()
-      error = nn.functional.smooth_l1_loss(guess, value)
+      gain = torch.min(ratio * advantage, ratio.clamp(1 - CLIP, 1 + CLIP) * advantage)
+      gain += ENTROPY * policy.entropy().sum(1)
       adam.zero_grad()
-      (error - gain - ENTROPY * policy.entropy().sum(1).mean()).backward()
+      (nn.functional.smooth_l1_loss(guess, value) - gain.mean()).backward()
       nn.utils.clip_grad_norm_(agent.parameters(), 1.0)
       adam.step()
       change = (0.5 * ((policy.mean - mean) / policy.stddev) ** 2).sum(1).mean().item()
@@ -91,7 +92,6 @@ def update(agent: Agent, adam: torch.optim.Adam, data: list[torch.Tensor]) -> No
       adam.param_groups[0]["lr"] = min(max(factor * adam.param_groups[0]["lr"], 5e-5), 2e-3)
 
 
-@torch.no_grad()
 def judge(agent: Agent, env) -> float:
   """Returns the share of worlds that succeed without noise, up to where it is clear."""
   seen, won = env.reset(seed=1_000_000)[0], torch.tensor(torch.nan)
@@ -114,7 +114,7 @@ def main() -> None:
   env = gymnasium.make_vec(name, num_envs=args.worlds, device=args.device, output="torch")
   seen = env.reset(seed=args.seed)[0]
   agent = Agent(look(seen).shape[1], env.action_space.sample().shape[1]).to(look(seen).device)
-  adam = torch.optim.Adam(agent.parameters(), lr=1e-3)
+  adam = torch.optim.Adam(agent.parameters(), lr=1e-3, fused=True)
   seen, won, _ = step(env, seen, agent(look(seen))[0].mean)  # compiles kernels
   won, lead, idle = torch.zeros(3, len(won), device=won.device)
   made, steps, judged, start = time.time() - start, 0, torch.nan, time.time()

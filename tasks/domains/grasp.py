@@ -20,11 +20,12 @@ before it is lowered start the holding again. Failure: a force above the damage 
 included, or the time limit.
 
 Shaping: until it is grasped 0.24 * `ready`, for jaws that are open near the site, are over the fold
-and close on it; then 0.26 - (0.14 + 0.15 * held) * min(height / lift, 1), less 0.15 * d / (1 + d)
-where the fold is pushed down by d lifts. So no grasp is paid less than what led to it, down to d of
-4, and most of what follows for the lift. Once held long enough it is -0.03, and more by 0.045 * (1
-- 2 * pinch / force limit), not below 0, while the fold rests low: jaws that loosen are about to let
-go.
+and close on it; then 0.26 - (0.16 + 0.15 * held) * min(height / lift, 1). Once held long enough it
+is -0.03 - 0.02 * height / lift, from 0 to 2 lifts, so that who holds the fold too high is told the
+way down too; and more by 0.045 * (1 - 2 * pinch / force limit), not below 0, while the fold rests
+low: jaws that loosen are about to let go. Where a held fold is pushed down by d lifts it is less by
+0.15 * d / (1 + d). So no grasp is paid less than what led to it, down to d of 4, and most of what
+follows for the lift.
 """
 
 import dataclasses
@@ -75,7 +76,7 @@ REST = 0.2  # at a low height before release [s]
 # Heights that it rests between, and is let go below, as shares of the lift.
 LOW, RESTING, LETTING = -0.25, 0.4, 0.5
 READY = 0.24  # shaping of jaws that are closed on the site, less than that of any grasp [-]
-TIGHT = -0.03  # shaping of a fold that was held long enough [-]
+TIGHT, HIGH = -0.03, -0.02  # shaping of a fold that was held long enough, and of a lift then [-]
 LOOSE = 0.045  # what it gains at rest in jaws without force [-]
 
 
@@ -283,15 +284,17 @@ def advance(s, o):
 
 def shaping(s, o):
   """Returns what tells the way to a grasp, up from any depth of the fold, and to let go of it."""
-  if o.done:
-    loose = clamp(1.0 - 2.0 * pinch(s) / o.force_limit, 0.0, 1.0)
-    return TIGHT + LOOSE * loose if o.lowered >= REST - SLACK else TIGHT
-  if o.grasped == 0.0:
+  if o.grasped == 0.0 and not o.done:
     return READY * ready(s, o)
   share = raised(s, o) / o.lift
   high, pushed = clamp(share, 0.0, 1.0), max(-share, 0.0)
-  lifted = high * (0.14 + (0.12 - TIGHT) * min(o.time / o.hold, 1.0))
-  return 0.26 - lifted - 0.15 * pushed / (1.0 + pushed)
+  deep = 0.15 * pushed / (1.0 + pushed)
+  if not o.done:
+    return 0.26 - high * (0.16 + (0.12 - TIGHT) * min(o.time / o.hold, 1.0)) - deep
+  loose = 0.0
+  if o.lowered >= REST - SLACK:
+    loose = LOOSE * clamp(1.0 - 2.0 * pinch(s) / o.force_limit, 0.0, 1.0)
+  return TIGHT + HIGH * clamp(share, 0.0, 2.0) + loose - deep
 
 
 def observe(s, o):

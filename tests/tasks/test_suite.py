@@ -152,7 +152,7 @@ def test_dense_reward_is_the_change_of_progress_and_takes_back_what_is_lost():
 
 def test_a_potential_shows_the_way_to_a_grasp():
   env = load("grasp/easy")
-  potential, loose = {}, []
+  task, potential, loose = env.task, {}, []
 
   def go(opening, *steps):
     """Notes the potential after moves to heights over the site and beside it [m], and openings."""
@@ -161,17 +161,19 @@ def test_a_potential_shows_the_way_to_a_grasp():
     act.begin()
     act.extra[:] = opening
     across, _, up = act.trocar.mat.T
-    site = env.physics.point(env.task.site)
+    site = env.physics.point(task.site)
     for name, height, opening, *aside in steps:
       for action in act.move(site + height * up + sum(aside) * across, speed=0.03):
         env.step(action)
       while act.extra[0] > opening:
         act.extra -= 0.03
         timestep = env.step(act.step())
-      potential[name] = env.task.progress + env.task.shaping
+      potential[name] = task.progress + task.shaping
       assert not timestep.last() and potential[name] < 1
-    env.task.done, env.task.lowered = True, grasp.REST
-    loose.append(grasp.shaping(env.physics, env.task) - grasp.TIGHT)
+    task.done, task.lowered = True, grasp.REST
+    resting = grasp.shaping(env.physics, task)
+    task.lowered = 0.0
+    loose.append(resting - grasp.shaping(env.physics, task))
 
   go(-0.68, ("beside, closed", 0.01, -0.68), ("pressed, closed", -0.006, -0.68))
   go(1.0, ("beside", 0.01, 1.0), ("over it", -0.006, 1.0), ("closing", -0.006, -0.2),
@@ -185,6 +187,12 @@ def test_a_potential_shows_the_way_to_a_grasp():
   assert potential["sunk in aside, closed"] < potential["beside"]
   assert potential["closing"] < potential["deep"] < potential["pushed"] - 0.02
   assert potential["pushed"] < potential["grasped"] - 0.02
+  told = []  # of a fold that was held long enough, far above the lift, above and at rest, and below
+  for lifts in (1.9, 1.2, 0.6, 0.0, -0.5, -2.0):
+    task.rest = env.physics.point(task.site) - lifts * task.lift * task.up
+    high = min(max(lifts, 0.0), 1.0)
+    told.append(0.9 + 0.05 * (1.0 - high) + grasp.shaping(env.physics, task))
+  assert (np.diff(told[:4]) > 0.01).all() and (np.diff(told[3:]) < -0.01).all()
 
 
 def test_quick_forms_agree_with_the_plain_ones():
