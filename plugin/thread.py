@@ -1,5 +1,6 @@
 """Surgical threads: `add_thread` adds one to an `mujoco.MjSpec`, `Thread` is the handle on it."""
 
+import functools
 from collections.abc import Mapping, Sequence
 
 import mujoco
@@ -188,6 +189,11 @@ class Thread:
     self.data.qpos[at] = self.model.qpos0[at] + local
     self.data.qvel[organ.dofs.reshape(-1, 3)[which]] = 0.0
 
+  @functools.cached_property
+  def holds(self) -> dict[str, int]:
+    """By what bodies can hold a node, see `hold`: numbers of equalities by name."""
+    return holds_of(self.model, self._space.organ.body)
+
   def hold(self, by: str, node: int, anchor: Sequence[float] = (0, 0, 0), firm: bool = True):
     """Lets a body hold a node, or none; near the node the thread does not meet that body.
 
@@ -201,12 +207,12 @@ class Thread:
       ValueError: an argument is not allowed.
     """
     organ, model = self._space.organ, self.model
-    holds, nnode = holds_of(model, organ.body), len(organ.rest)
-    if by not in holds:
-      raise no_hold(self.name, by, holds)
+    nnode = len(organ.rest)
+    if by not in self.holds:
+      raise no_hold(self.name, by, self.holds)
     if not -1 <= node < nnode:
       raise ValueError(f"thread {self.name!r}: node is {node}, expected one in [-1, {nnode})")
-    which = holds[by]
+    which = self.holds[by]
     self.data.eq_active[which] = node >= 0
     if node >= 0:
       solref, impedance = HELD if firm else LOOSE

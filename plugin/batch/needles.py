@@ -36,6 +36,7 @@ class ToldNeedles:
 class Needles(tuple_of(ToldNeedles)):
   """The arrays of `ToldNeedles`."""
 
+
 _OF_HOLES = [name for name in ToldNeedles.vars if name.startswith("hole_")]
 _OF_NEEDLES = ("touches", "inside", "force", "tip_force", "energy")
 

@@ -18,7 +18,7 @@ from palpate.engine import plugin as engine
 from palpate.engine.cutting import cuts as cutting
 from palpate.engine.model.declare import Declaration
 from palpate.organ import Organ, instances
-from palpate.thread import Thread, holds_of
+from palpate.thread import Thread
 from palpate.tissue import body as bodies
 from palpate.tissue.cutting.topology import Report
 from palpate.tissue.device import free_memory, refuse_crowd
@@ -309,7 +309,7 @@ class _Thread(base.Thread):
     self._batch = batch
     number = instances(batch.model, dim=1)[name]
     self.space = engine.find_thread(batch.datas[0]._address, number)
-    self.nworld, self.holds = batch.nworld, holds_of(batch.model, self.space.organ.body)
+    self.nworld, self.holds = batch.nworld, self.handles[0].holds
 
   @property
   def xpos(self) -> wp.array:

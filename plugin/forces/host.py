@@ -39,6 +39,7 @@ numbers = doubles("nnumber")  # of a tissue, see `NUMBERS`; in a batch a row a w
 class Bodies:
   """What forces read and write of MuJoCo's own memory."""
 
+
 @struct
 class Nodes:
   """Where an organ's vertices are: in MuJoCo's memory, or with windows in the plugin state."""

@@ -31,6 +31,7 @@ class Told:
 class Cutters(tuple_of(Told)):
   """The arrays of `Told`."""
 
+
 @wp.kernel(enable_backward=False)
 def _show(b: _WorldBlades, out: Told):
   """Writes what cutters do, in the world's axes."""

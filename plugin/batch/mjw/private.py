@@ -37,28 +37,10 @@ from mujoco_warp._src.types import (
 )
 
 __all__ = [
-  "MJ_MAX_EPAFACES",
-  "MJ_MAX_EPAHORIZON",
-  "ConstraintState",
-  "ConstraintType",
-  "ContactType",
-  "DeterminismType",
-  "Geom",
-  "GeomType",
-  "OverflowType",
-  "box_triangle",
-  "capsule_triangle",
-  "ccd",
-  "contact_kbimp",
-  "instead",
-  "jac_dof",
-  "of_threads",
-  "passive",
-  "ray_geom",
-  "sensor",
-  "solver",
-  "sphere_triangle",
-  "vec5",
+  "MJ_MAX_EPAFACES", "MJ_MAX_EPAHORIZON", "ConstraintState", "ConstraintType", "ContactType",
+  "DeterminismType", "Geom", "GeomType", "OverflowType", "box_triangle", "capsule_triangle", "ccd",
+  "contact_kbimp", "instead", "jac_dof", "of_threads", "passive", "ray_geom", "sensor", "solver",
+  "sphere_triangle", "vec5",
 ]  # fmt: skip
 
 # Large functions with many callers: inlined, they made kernels of contacts with flexes, of which we
