@@ -40,8 +40,8 @@ _MUJOCOS = (
 )
 _WRITTEN = (
   *("start", "vel", "external", "aim", "place", "turn", "force", "move", "trial", "gradient"),
-  *("matrix", "inverse", "rank", "near", "ranked", "first", "start_of_row", "below", "status"),
-  *("count", "smooth", "reach", "listed", "pair", "pressure", "touch"),
+  *("matrix", "inverse", "rank", "near", "ranked", "first", "start_of_row", "last", "below"),
+  *("status", "count", "smooth", "reach", "listed", "pair", "pressure", "touch"),
   *("row_kind", "row_node", "row_efc", "row_tree", "row_yields", "row_body"),
   *("row_value", "grip", "known", "speed"),
 )
@@ -93,6 +93,7 @@ class Rod:
   ranked: doubles("nunknown", 4)  # scratch
   first: ints("nunknown")  # first column of each row
   start_of_row: ints("nunknown")  # where it is
+  last: ints("nunknown")  # scratch, see `Envelope`
   below: ints("nunknown")  # scratch
   status: ints(1)  # iterations; -1: not finite; more than `newton`: not solved
   count: ints(4)  # rows of constraints that act on the rod; pairs of edges listed; entries; nodes

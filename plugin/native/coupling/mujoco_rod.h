@@ -88,14 +88,14 @@ struct MujocoRod {
     const int nefc = datum<int>(f, DATA_NEFC), ncon = nefc > 0 ? datum<int>(f, DATA_NCON) : 0;
     char* const contacts = datum<char*>(f, DATA_CONTACT);
     note_grips(*this, nefc, datum<int*>(f, DATA_EFC_TYPE));
-    for (int c = 0; c < ncon; ++c) {
+    note_each(rod, ncon, [&](int c, int at) {
       const char* contact = contacts + (size_t)CONTACT_LENGTH * c;
       const Rows rows = is_own(contact) ? rows_of(f, contact) : Rows{0, 0, false};
-      if (!rows.count) continue;
+      if (!rows.count) return 0;
       if (is_open(*this, (const int*)(contact + CONTACT_FLEX), (const int*)(contact + CONTACT_ELEM),
                   (const int*)(contact + CONTACT_GEOM))) {  // MuJoCo still has it
         empty(rows);
-        continue;
+        return 0;
       }
       const double margin = f.flex_margin.data[f.flex];
       const bool organ = side_of(contact, CONTACT_FLEX, 0) >= 0 && side_of(contact, CONTACT_FLEX, 1) >= 0;
@@ -103,9 +103,9 @@ struct MujocoRod {
         keep_closed(f, contact, rows, margin);
       else
         set_gap(f, rows, *(const double*)(contact + CONTACT_DIST) + margin);
-      note_contact(*this, rows.first, rows.count, !rows.paired && rows.count > 1,
-                   *(const double*)(contact + CONTACT_MU), (const double*)(contact + CONTACT_FRICTION), !organ);
-    }
+      return note_contact(*this, at, rows.first, rows.count, !rows.paired && rows.count > 1,
+                          *(const double*)(contact + CONTACT_MU), (const double*)(contact + CONTACT_FRICTION), !organ);
+    });
     const int* type = datum<int*>(f, DATA_EFC_TYPE);
     note_joints(*this, nefc, type);
     yield_trees(*this, h, nefc, type, datum<int*>(f, DATA_EFC_ID));

@@ -61,6 +61,15 @@ struct Tree {
   }
   PALPATE double inertia(int d) const { return host.M()[host.f.M_rowadr.data[d] + host.f.M_rownnz.data[d] - 1]; }
 
+  // Whether a row reaches dofs that are not the rod's nor taken.
+  template <class Row>
+  PALPATE bool lacks(Row row) const {
+    for (int k = 0; k < row.count; ++k) {
+      const int d = row.dof ? row.dof[k] : k;
+      if (row.value[k] != 0.0 && host.own_dof(d) < 0 && find(d) < 0) return count < REACH;
+    }
+    return false;
+  }
   // Takes the dofs of a row that are not the rod's.
   template <class Row>
   PALPATE void take(Row row) {
@@ -81,34 +90,50 @@ struct Tree {
       L[a][a] += h * host.damping(dof[a]);
     }
   }
-  // Adds what row `r` holds it by, where that bore in the last step or does always; returns whether it did.
-  PALPATE bool hold_by(int r, bool always) {
+  // What a row holds it by.
+  struct Hold {
+    double J[REACH], gives;
+    int row;
+  };
+  // Finds what row `r` holds it by, where that bore in the last step or does always; returns whether it did.
+  PALPATE bool holds(int r, bool always, Hold& own) const {
     const auto row = host.row(r);
-    double J[REACH] = {}, gives = 0.0, goes = 0.0;
+    double goes = 0.0;
     bool here = false;
+    own.gives = 0.0;
+    own.row = r;
+    for (int a = 0; a < REACH; ++a) own.J[a] = 0.0;
     for (int k = 0; k < row.count; ++k) {
-      const int d = row.dof ? row.dof[k] : k, own = find(d);
+      const int d = row.dof ? row.dof[k] : k, at = find(d);
       if (row.value[k] == 0.0) continue;
       if (host.own_dof(d) >= 0) return false;
       goes += row.value[k] * host.last_acceleration(d);
-      if (own >= 0) J[own] = row.value[k], here = true;
-      else gives += row.value[k] * row.value[k] / inertia(d);
+      if (at >= 0) own.J[at] = row.value[k], here = true;
+      else own.gives += row.value[k] * row.value[k] / inertia(d);
     }
     if (!here || !(always || goes < host.reference(r))) return false;
-    gives += 1.0 / host.stiffness(r);
-    for (int a = 0; a < count; ++a)
-      for (int b = 0; b <= a; ++b) L[a][b] += J[a] * J[b] / gives;
+    own.gives += 1.0 / host.stiffness(r);
     return true;
+  }
+  PALPATE void hold_by(const Hold& own) {
+    for (int a = 0; a < count; ++a)
+      for (int b = 0; b <= a; ++b) L[a][b] += own.J[a] * own.J[b] / own.gives;
   }
   // Adds all that holds it.
   PALPATE void hold(int nefc, const int* type, const int* id) {
-    bool held = false;
-    for (int k = 0; k < nefc; ++k) {
-      if (type[k] != IS_EQUALITY && type[k] < IS_LIMIT) continue;  // friction of joints
-      const bool tangent = k > 0 && type[k] == CONTACT_ELLIPTIC && type[k - 1] == type[k] && id[k - 1] == id[k];
-      if (tangent && held) hold_by(k, true);
-      if (!tangent) held = hold_by(k, type[k] == IS_EQUALITY);
-    }
+    const auto is_tangent = [&](int k) {
+      return k > 0 && k < nefc && type[k] == CONTACT_ELLIPTIC && type[k - 1] == type[k] && id[k - 1] == id[k];
+    };
+    const auto finds = [&](int k, Hold& own) {
+      if (type[k] != IS_EQUALITY && type[k] < IS_LIMIT) return false;  // friction of joints
+      return !is_tangent(k) && holds(k, type[k] == IS_EQUALITY, own);
+    };
+    each_in_turn<Hold>(nefc, finds, [&](const Hold& own) {
+      hold_by(own);
+      Hold tangent;
+      for (int k = own.row + 1; is_tangent(k); ++k)
+        if (holds(k, true, tangent)) hold_by(tangent);
+    });
   }
   // Factorizes its inertia, and finds by what the force on it has changed.
   PALPATE void factorize() {
@@ -140,15 +165,15 @@ struct Tree {
   }
 };
 
-// Notes MuJoCo's row `r` where it acts on the rod; returns whether it does. A row of a cone that turns others
-// about the contact does not reach nodes, and is one of the node `cone`.
+// Notes MuJoCo's row `r` as the rod's row `at`, see `each_after`, where it acts on the rod; returns the node, or less than
+// 0 where it does not. A row of a cone that turns others about the contact does not reach nodes, and is one of the node
+// `cone`.
 template <class Host>
-PALPATE bool note_row(const Host& host, int r, int kind, double friction, int cone = NOWHERE) {
+PALPATE int note_row(const Host& host, int at, int r, int kind, double friction, int cone = NOWHERE) {
   const auto& rod = host.rod;
-  const int at = rod.count.data[0];
   const auto row = host.row(r);
   const int reached = first_node(host, row), node = reached == NOWHERE ? cone : reached;
-  if (node < 0 || at >= rod.most_rows) return false;
+  if (node < 0 || at < 0 || at >= rod.most_rows) return node;
   double* J = rod.row_value.data + (DOFS + 3) * at;
   double sum = -host.reference(r);
   int tree = NOWHERE;
@@ -169,56 +194,70 @@ PALPATE bool note_row(const Host& host, int r, int kind, double friction, int co
   rod.row_efc.data[at] = r;
   rod.row_tree.data[at] = tree;
   rod.row_yields.data[at] = NOWHERE;
-  rod.count.data[0] = at + 1;
-  return true;
+  return node;
+}
+
+// Notes rows by puts(k, at) for each k up to n, see `each_after`, as far as there is room.
+template <class Rod, class Puts>
+PALPATE void note_each(const Rod& rod, int n, Puts puts) {
+  const int before = rod.count.data[0];
+  const int all = before + each_after(n, [&](int k, int at) { return puts(k, at < 0 ? at : before + at); });
+  one_lane([&] { rod.count.data[0] = all < rod.most_rows ? all : rod.most_rows; });
 }
 
 // Notes by which tree of bodies an equality holds each node, or one near it along the thread; NOWHERE if by none.
 template <class Host>
 PALPATE void note_grips(const Host& host, int nefc, const int* type) {
   const auto& rod = host.rod;
-  for (int i = 0; i < rod.nnode; ++i) rod.grip.data[i] = NOWHERE;
-  for (int r = 0; r < nefc; ++r) {
-    if (type[r] != IS_EQUALITY) continue;
+  struct Grip { int node, tree; };
+  each_lane(0, rod.nnode, [&](int i) { rod.grip.data[i] = NOWHERE; });
+  const auto grips = [&](int r, Grip& own) {
+    if (type[r] != IS_EQUALITY) return false;
     const auto row = host.row(r);
-    const int node = first_node(host, row);
-    if (node < 0) continue;
-    int tree = NOWHERE;
-    for (int k = 0; k < row.count; ++k) {
+    own = {first_node(host, row), NOWHERE};
+    for (int k = 0; k < row.count && own.node >= 0; ++k) {
       const int dof = row.dof ? row.dof[k] : k;
-      if (row.value[k] != 0.0 && host.own_dof(dof) < 0) tree = host.f.dof_tree.data[dof];
+      if (row.value[k] != 0.0 && host.own_dof(dof) < 0) own.tree = host.f.dof_tree.data[dof];
     }
-    for (int i = 0; i < rod.nnode && tree >= 0; ++i)
-      if (fabs(rod.along.data[i] - rod.along.data[node]) <= GRIP * rod.radius) rod.grip.data[i] = tree;
-  }
+    return own.tree >= 0;
+  };
+  each_in_turn<Grip>(nefc, grips, [&](const Grip& own) {
+    each_lane(0, rod.nnode, [&](int i) {
+      if (fabs(rod.along.data[i] - rod.along.data[own.node]) <= GRIP * rod.radius) rod.grip.data[i] = own.tree;
+    });
+  });
 }
 
-// Notes the rows of a contact, of a cone where `mu` says so, whole or not at all; `yields`: its other side does.
+// Notes the rows of a contact from the rod's row `before` on, of a cone where `mu` says so, whole or not at all; returns
+// how many there are. `yields`: its other side does.
 template <class Host, class Number>
-PALPATE void note_contact(
-    const Host& host, int first, int count, bool cone, double mu, const Number* friction, bool yields) {
-  const int before = host.rod.count.data[0];
+PALPATE int note_contact(
+    const Host& host, int before, int first, int count, bool cone, double mu, const Number* friction, bool yields) {
+  int noted = 0, node = NOWHERE;
   for (int k = 0; k < count; ++k) {
     const double slope = !cone ? 0.0 : k ? (double)friction[k - 1] : mu;
-    const int node = cone && k ? host.rod.row_node.data[before] : NOWHERE;
-    const bool noted = note_row(host, first + k, !cone ? ONE : k ? FRICTION : CONE, slope, node);
-    if (noted || !cone) continue;
-    host.rod.count.data[0] = before;
-    break;
+    const int at = before < 0 ? before : before + noted;
+    const int found = note_row(host, at, first + k, !cone ? ONE : k ? FRICTION : CONE, slope, node);
+    if (found < 0 && cone) return 0;
+    if (found < 0) continue;
+    if (cone && !k) node = found;
+    ++noted;
   }
   int* tree = host.rod.row_tree.data;  // of all rows alike: a slide's normal may reach what its tangents do not
   int reached = NOWHERE;
-  for (int at = before; at < host.rod.count.data[0]; ++at) reached = tree[at] > reached ? tree[at] : reached;
-  for (int at = before; at < host.rod.count.data[0]; ++at) tree[at] = yields ? reached : FREE;
+  const int end = before < 0 ? before : before + noted < host.rod.most_rows ? before + noted : host.rod.most_rows;
+  for (int at = before; at < end; ++at) reached = tree[at] > reached ? tree[at] : reached;
+  for (int at = before; at < end; ++at) tree[at] = yields ? reached : FREE;
+  return noted;
 }
 
 // Notes the rows of equalities, and of limits.
 template <class Host>
 PALPATE void note_joints(const Host& host, int nefc, const int* type) {
-  for (int r = 0; r < nefc; ++r) {
-    if (type[r] == IS_EQUALITY) note_row(host, r, BOTH, 0.0);
-    if (type[r] == IS_LIMIT) note_row(host, r, ONE, 0.0);
-  }
+  note_each(host.rod, nefc, [&](int r, int at) {
+    if (type[r] != IS_EQUALITY && type[r] != IS_LIMIT) return 0;
+    return note_row(host, at, r, type[r] == IS_EQUALITY ? BOTH : ONE, 0.0) < 0 ? 0 : 1;
+  });
 }
 
 // Lets the tree of bodies that row `first` reaches yield in the rod's step, by coordinates in which its inertia is
@@ -229,19 +268,23 @@ PALPATE void yield_tree(const Host& host, int first, double h, int nefc, const i
   const auto& rod = host.rod;
   const int n = rod.count.data[0], tree = rod.row_tree.data[first], node = nodes_of(rod);
   if (node + REACH / 3 > rod.most_nodes) {
-    for (int at = first; at < n; ++at)
+    each_lane(first, n, [&](int at) {
       if (rod.row_tree.data[at] == tree) rod.row_tree.data[at] = FREE;
+    });
     return;
   }
-  Tree<Host> other{host};
-  for (int at = first; at < n; ++at)
-    if (rod.row_tree.data[at] == tree) other.take(host.row(rod.row_efc.data[at]));
-  rod.count.data[3] += (other.count + 2) / 3;
+  Tree<Host> other{host};  // of all lanes alike
+  const auto adds = [&](int k, int& own) {
+    own = rod.row_efc.data[first + k];
+    return rod.row_tree.data[first + k] == tree && other.lacks(host.row(own));
+  };
+  each_in_turn<int>(n - first, adds, [&](int r) { other.take(host.row(r)); });
+  one_lane([&] { rod.count.data[3] += (other.count + 2) / 3; });
   other.weigh(h);
   other.hold(nefc, type, id);
   other.factorize();
-  for (int at = first; at < n; ++at) {
-    if (rod.row_tree.data[at] != tree) continue;
+  each_lane(first, n, [&](int at) {
+    if (rod.row_tree.data[at] != tree) return;
     double* J = rod.row_body.data + REACH * at;
     const auto row = host.row(rod.row_efc.data[at]);
     other.reach(row, J);
@@ -253,7 +296,7 @@ PALPATE void yield_tree(const Host& host, int first, double h, int nefc, const i
     }
     for (int a = 0; a < other.count; ++a) rest += J[a] * other.change[a];
     rod.row_yields.data[at] = node;
-  }
+  });
 }
 
 // Lets the bodies that the noted rows reach yield.
@@ -266,7 +309,7 @@ PALPATE void yield_trees(const Host& host, double h, int nefc, const int* type, 
 
 template <class Rod>
 PALPATE Envelope inverse_of(const Rod& rod) {
-  return {rod.inverse.data, rod.first.data, rod.start_of_row.data, matrix_of(rod).n};
+  return {rod.inverse.data, rod.first.data, rod.start_of_row.data, rod.last.data, matrix_of(rod).n};
 }
 
 // An inertia of a node alone in the rod's step that is no more than in any direction, and no less than a third of
@@ -293,11 +336,11 @@ template <class Host>
 PALPATE void freeze(const Host& host, double h) {
   constexpr double SOFTER = 1e6;
   const auto& rod = host.rod;
-  for (int at = 0; at < rod.count.data[0]; ++at) {
-    if (rod.row_tree.data[at] == FREE) continue;
+  each_lane(0, rod.count.data[0], [&](int at) {
+    if (rod.row_tree.data[at] == FREE) return;
     const int r = rod.row_efc.data[at];
     host.soften(r, SOFTER, host.reference(r) + (1.0 - SOFTER) * residual_of(rod, at, h));
-  }
+  });
 }
 
 // Whether there is a row that is free.
@@ -317,10 +360,8 @@ PALPATE void begin(const Host& host, double h) {
     rod.known.data[d] = host.known(d);
     rod.speed.data[d] = host.speed(d);
   });
-  one_lane([&] {
-    rod.count.data[0] = rod.count.data[3] = 0;
-    host.note_rows(h);
-  });
+  one_lane([&] { rod.count.data[0] = rod.count.data[3] = 0; });
+  host.note_rows(h);
   const int status = step_rod(rod, h);
   ties_energy(rod, rod.place.data, nullptr, nullptr);
   const bool ok = status >= 0, touched = ok && rod.count.data[0] > 0;
@@ -330,10 +371,10 @@ PALPATE void begin(const Host& host, double h) {
   bool free = false;
   if (touched) {
     const RodMatrix H = matrix_of(rod);
-    one_lane([&] { lay_out(rod, rod.place.data); });
+    lay_out(rod, rod.place.data);
     each_lane(0, 4 * nodes_of(rod), [&](int a) { rod.force.data[a] = 0.0; });
     rows_cost(rod, rod.place.data, h, rod.force.data, &H);
-    one_lane([&] { freeze(host, h); });
+    freeze(host, h);
     free = is_free(rod);
   }
   if (free) {
@@ -376,16 +417,20 @@ PALPATE bool is_open(const Host& host, const int* flex, const int* elem, const i
 // Breaks the edge with the highest tension at the end of a step, if that is more than it bears.
 template <class Rod>
 PALPATE void break_edge(const Rod& rod) {
-  int weakest = -1;
   double most = rod.strength;
-  for (int i = 0; i + 1 < rod.nnode && rod.strength > 0.0; ++i) {
+  each_lane(0, rod.strength > 0.0 ? rod.nnode - 1 : 0, [&](int i) {
     const double tension = tension_of(rod, rod.place.data, i);
-    if (tension > most) most = tension, weakest = i;
-  }
-  if (weakest < 0) return;
-  rod.own.broken.data[weakest] = 1.0;
-  rod.own.twist.data[weakest] = 0.0;  // of its two nodes
-  rod.own.twist.data[weakest + 1] = 0.0;
+    most = tension > most ? tension : most;
+  });
+  most = most_together(most);
+  if (!(most > rod.strength)) return;
+  one_lane([&] {
+    int weakest = 0;
+    while (tension_of(rod, rod.place.data, weakest) != most) ++weakest;
+    rod.own.broken.data[weakest] = 1.0;
+    rod.own.twist.data[weakest] = 0.0;  // of its two nodes
+    rod.own.twist.data[weakest + 1] = 0.0;
+  });
 }
 
 // Keeps what pushed other bodies, and how they accelerated.
@@ -396,16 +441,17 @@ PALPATE void note_pushed(const Host& host, double h) {
     rod.own.pushed.data[d] = rod.known.data[d];
     rod.own.accelerated.data[d] = (host.speed(d) - rod.speed.data[d]) / h;
   });
-  one_lane([&] {
-    for (int at = 0; at < rod.count.data[0]; ++at) {
-      if (rod.row_tree.data[at] < 0) continue;
-      const auto row = host.row(rod.row_efc.data[at]);
-      const double force = host.force(rod.row_efc.data[at]);
-      for (int k = 0; k < row.count && force != 0.0; ++k) {
-        const int d = row.dof ? row.dof[k] : k;
-        if (host.own_dof(d) < 0) rod.own.pushed.data[d] += row.value[k] * force;
-      }
-    }
+  const auto pushes = [&](int at, int& r) {
+    r = rod.row_efc.data[at];
+    return rod.row_tree.data[at] >= 0 && host.force(r) != 0.0;
+  };
+  each_in_turn<int>(rod.count.data[0], pushes, [&](int r) {
+    const auto row = host.row(r);
+    const double force = host.force(r);
+    each_lane(0, row.count, [&](int k) {
+      const int d = row.dof ? row.dof[k] : k;
+      if (host.own_dof(d) < 0) rod.own.pushed.data[d] += row.value[k] * force;
+    });
   });
 }
 
@@ -431,7 +477,7 @@ PALPATE void end(const Host& host, double h) {
   const int inner = rod.twists ? rod.nnode - 1 : 0;
   each_lane(1, inner, [&](int i) { rod.trial.data[i] = twist_at(rod, rod.place.data, rod.turn.data, i); });
   each_lane(1, inner, [&](int i) { rod.own.twist.data[i] = is_joint(rod, i) ? rod.trial.data[i] : 0.0; });
-  one_lane([&] { break_edge(rod); });
+  break_edge(rod);
   each_lane(0, rod.nnode, [&](int i) {
     if (!host.moves(i)) return;
     host.move(i, load(rod.place.data + 3 * i) - load(rod.start.data + 3 * i), h);

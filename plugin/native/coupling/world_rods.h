@@ -81,14 +81,13 @@ struct WorldRod {
     const int most = (int)f.aref.shape[1], nefc = f.nefc.data[0] < most ? f.nefc.data[0] : most;
     const int* type = f.type.data;
     note_grips(*this, nefc, type);
-    for (int r = 0, count = 1; r < nefc; r += count) {
-      count = 1;
-      if (type[r] < IS_CONTACT) continue;
-      const int c = f.id.data[r], dim = f.contact_dim.data[c];
+    note_each(rod, nefc, [&](int r, int at) {
+      const int c = f.id.data[r];
+      if (type[r] < IS_CONTACT || (r && type[r - 1] >= IS_CONTACT && f.id.data[r - 1] == c)) return 0;
       const bool paired = type[r] == CONTACT_PYRAMIDAL;
-      count = paired ? 2 * (dim - 1) : dim;
+      const int dim = f.contact_dim.data[c], count = paired ? 2 * (dim - 1) : dim;
       const int *flex = (const int*)f.contact_flex.data + 2 * c, *geom = (const int*)f.contact_geom.data + 2 * c;
-      if ((flex[0] != f.flex && flex[1] != f.flex) || r + count > nefc) continue;
+      if ((flex[0] != f.flex && flex[1] != f.flex) || r + count > nefc) return 0;
       if (is_open(*this, flex, (const int*)f.contact_elem.data + 2 * c, geom)) {
         // mujoco_warp still has it
         for (int k = r; k < r + count; ++k) {
@@ -96,12 +95,12 @@ struct WorldRod {
           for (int a = 0; a < own.count; ++a) own.value[a] = 0.0f;
           f.aref.data[k] = 0.0f;
         }
-        continue;
+        return 0;
       }
       const float* friction = (const float*)f.contact_friction.data + 5 * c;
-      note_contact(*this, r, count, !paired && count > 1, friction[0] / sqrt(f.impratio), friction,
-                   geom[0] >= 0 || geom[1] >= 0);
-    }
+      return note_contact(*this, at, r, count, !paired && count > 1, friction[0] / sqrt(f.impratio), friction,
+                          geom[0] >= 0 || geom[1] >= 0);
+    });
     note_joints(*this, nefc, type);
     yield_trees(*this, h, nefc, type, f.id.data);
   }

@@ -8,11 +8,13 @@ AS_WRITTEN
 
 namespace palpate {
 
-// The lower triangle: row i has the columns first[i] to i, at `start[i]`.
+// The lower triangle: row i has the columns first[i] to i, at `start[i]`; `last`, of which each column has a number, is
+// scratch.
 struct Envelope {
   double* value;
   const int* first;
   const int* start;
+  int* last;
   int n;
 
   // Row i, to be indexed by the column.
@@ -45,13 +47,23 @@ PALPATE double dot_of(const double* a, const double* b, int n) {
   return sum_of(s) + rest;
 }
 
+// Of the lower triangle of a matrix, row by row, the entry of a number.
+struct Corner { int row, column; };
+PALPATE Corner corner(int number) {
+  int row = (int)(0.5f * (sqrtf(8.0f * number + 1.0f) - 1.0f));
+  if (row * (row + 1) / 2 > number) --row;
+  if ((row + 1) * (row + 2) / 2 <= number) ++row;
+  return {row, number - row * (row + 1) / 2};
+}
+
 // L D L^T = A in place of A: the unit lower triangle L, and on its diagonal 1 / D. Every ROWS rows have the same
 // first column and are taken together. `u` is scratch, ROWS n long. Returns whether A is positive definite, and
 // stops where it is not.
 template <int ROWS>
 PALPATE bool factorize(const Envelope& A, double* u);
 
-// A^-1 b in place of b, from the factors.
+// A^-1 b in place of b, from the factors, whose rows come as they were taken together.
+template <int ROWS>
 CALLED void solve_factorized(const Envelope& L, double* b);
 
 // The entries of A^-1 there, from the factors (Erisman and Tinney 1975, doi:10.1145/360680.360704). `below` and `u`
@@ -60,63 +72,120 @@ PALPATE void invert_there(const Envelope& L, const Envelope& Z, int* below, doub
 
 #if ON_CUDA
 
-// L^-1 u in place of u, ROWS times, from column `lo`, before which it is 0, to `hi`. A lane has a column of every
-// TOGETHER.
+// Notes of every ROWS columns, node by node, which is the last node that has them.
 template <int ROWS>
-PALPATE void substitute(const Envelope& L, int lo, int hi, double* u) {
-  for (int from = lo; from < hi; from += TOGETHER) {
-    const int j = from + own_lane(), end = from + TOGETHER < hi ? from + TOGETHER : hi;
-    const int first = j < hi ? L.first[j] : end;
-    const double* row = j < hi ? L.row(j) : nullptr;
-    double own[ROWS];
-    for (int r = 0; r < ROWS; ++r) own[r] = j < hi ? u[r * L.n + j] : 0.0;
-    for (int k = first > lo ? first : lo; k < from; ++k)
-      for (int r = 0; r < ROWS; ++r) own[r] -= u[r * L.n + k] * row[k];
-    __syncwarp();
-    for (int k = from; k < end; ++k) {
-      const double l = k >= first && k < j ? row[k] : 0.0;
-      for (int r = 0; r < ROWS; ++r) own[r] -= __shfl_sync(0xffffffffu, own[r], k - from) * l;
-    }
-    for (int r = 0; r < ROWS && j < hi; ++r) u[r * L.n + j] = own[r];
-    meet_lanes();
+PALPATE void note_last(const Envelope& A) {
+  const int count = A.n / ROWS;
+  each_lane(0, count, [&](int p) { A.last[p] = p; });
+  each_lane(0, count, [&](int p) { raise(A.last[A.first[ROWS * p] / ROWS], p); });
+  int most = 0;
+  for (int from = 0; from < count; from += TOGETHER) {
+    const int p = from + own_lane(), own = p < count ? A.last[p] : 0, up_to = most_up_to(own > most ? own : most);
+    if (p < count) A.last[p] = up_to;
+    most = of_last_lane(up_to);
   }
+  meet_lanes();
 }
 
+// Node by node from the first one on, and what is left of those after it by all lanes.
 template <int ROWS>
 PALPATE bool factorize(const Envelope& A, double* u) {
-  for (int i = 0; i < A.n; i += ROWS) {
-    const int lo = A.first[i];
-    each_lane(lo, i, [&](int j) {
-      for (int r = 0; r < ROWS; ++r) u[r * A.n + j] = A.row(i + r)[j];
-    });
-    substitute<ROWS>(A, lo, i, u);  // u = L D of the rows
-    for (int r = 0; r < ROWS; ++r) {
-      double *row = A.row(i + r), *own = u + r * A.n, pivot = 0.0;
-      for (int j = i; j < i + r; ++j) {
-        double sum = 0.0;
-        each_lane(lo, j, [&](int k) { sum += own[k] * A.row(j)[k]; });
-        sum = sum_together(sum);
-        one_lane([&] { own[j] = row[j] - sum; });
+  note_last<ROWS>(A);
+  each_lane(0, A.n, [&](int i) { u[i] = A.row(i)[i]; });
+  for (int p = 0; p < A.n / ROWS; ++p) {
+    const int i = ROWS * p, after = p + 1, behind = A.last[p] + 1;
+    double l[ROWS][ROWS], d[ROWS], rest[ROWS];  // the pivot's factors, by all lanes alike
+    for (int a = 0; a < ROWS; ++a) {
+      const double* row = A.row(i + a) + i;
+      for (int b = 0; b <= a; ++b) l[a][b] = row[b];
+    }
+    for (int a = 0; a < ROWS; ++a) {
+      for (int b = 0; b < a; ++b)
+        for (int c = 0; c < b; ++c) l[a][b] -= l[a][c] * l[b][c];
+      d[a] = l[a][a];
+      for (int b = 0; b < a; ++b) {
+        const double own = l[a][b] * rest[b];
+        d[a] -= own * l[a][b];
+        l[a][b] = own;
       }
-      each_lane(lo, i + r, [&](int j) {
-        row[j] = own[j] * A.row(j)[j];
-        pivot += row[j] * own[j];
-      });
-      const double whole = row[i + r], rest = whole - sum_together(pivot);
-      if (!(rest > 1e-12 * whole)) return false;
-      one_lane([&] { row[i + r] = 1.0 / rest; });
+      if (!(d[a] > 1e-12 * u[i + a])) return false;
+      rest[a] = 1.0 / d[a];
+    }
+    each_lane(after, behind, [&](int k) {
+      if (A.first[ROWS * k] > i) return;
+      for (int a = 0; a < ROWS; ++a) {
+        double own[ROWS], *row = A.row(ROWS * k + a) + i;
+        for (int b = 0; b < ROWS; ++b) {
+          own[b] = row[b];
+          for (int c = 0; c < b; ++c) own[b] -= own[c] * l[b][c];
+          row[b] = own[b] * rest[b];
+        }
+      }
+    });
+    const int left = behind - after;
+    each_lane(0, left * (left + 1) / 2, [&](int pair) {
+      const Corner at = corner(pair);
+      const int k = after + at.row, m = after + at.column;
+      if (A.first[ROWS * k] > i || A.first[ROWS * m] > i) return;
+      double other[ROWS][ROWS];
+      for (int b = 0; b < ROWS; ++b)
+        for (int c = 0; c < ROWS; ++c) other[b][c] = d[c] * A.row(ROWS * m + b)[i + c];
+      for (int a = 0; a < ROWS; ++a) {
+        double* row = A.row(ROWS * k + a);
+        for (int b = 0; b < (k == m ? a + 1 : ROWS); ++b) {
+          double sum = 0.0;
+          for (int c = 0; c < ROWS; ++c) sum += row[i + c] * other[b][c];
+          row[ROWS * m + b] -= sum;
+        }
+      }
+    });
+    if (own_lane() < ROWS) {
+      double* row = A.row(i + own_lane()) + i;
+      for (int a = 0; a < ROWS; ++a) {
+        if (own_lane() != a) continue;
+        for (int b = 0; b < a; ++b) row[b] = l[a][b];
+        row[a] = rest[a];
+      }
     }
   }
+  meet_lanes();
   return true;
 }
 
+template <int ROWS>
 CALLED void solve_factorized(const Envelope& L, double* b) {
-  substitute<1>(L, 0, L.n, b);
-  each_lane(0, L.n, [&](int i) { b[i] *= L.row(i)[i]; });
-  for (int i = L.n - 1; i >= 0; --i) {
-    const double* row = L.row(i);
-    each_lane(L.first[i], i, [&](int k) { b[k] -= row[k] * b[i]; });
+  for (int i = 0; i < L.n; i += ROWS) {
+    double y[ROWS];
+    for (int a = 0; a < ROWS; ++a) {
+      y[a] = b[i + a];
+      for (int c = 0; c < a; ++c) y[a] -= L.row(i + a)[i + c] * y[c];
+    }
+    each_lane(i + ROWS, ROWS * (L.last[i / ROWS] + 1), [&](int k) {
+      if (L.first[k] > i) return;
+      double sum = 0.0;
+      for (int c = 0; c < ROWS; ++c) sum += L.row(k)[i + c] * y[c];
+      b[k] -= sum;
+    });
+    if (own_lane() == 0)
+      for (int a = 1; a < ROWS; ++a) b[i + a] = y[a];
   }
+  meet_lanes();
+  each_lane(0, L.n, [&](int i) { b[i] *= L.row(i)[i]; });
+  for (int i = L.n - ROWS; i >= 0; i -= ROWS) {
+    double x[ROWS];
+    for (int a = ROWS - 1; a >= 0; --a) {
+      x[a] = b[i + a];
+      for (int c = a + 1; c < ROWS; ++c) x[a] -= L.row(i + c)[i + a] * x[c];
+    }
+    each_lane(L.first[i], i, [&](int k) {
+      double sum = 0.0;
+      for (int c = 0; c < ROWS; ++c) sum += L.row(i + c)[k] * x[c];
+      b[k] -= sum;
+    });
+    if (own_lane() == 0)
+      for (int a = 0; a + 1 < ROWS; ++a) b[i + a] = x[a];
+  }
+  meet_lanes();
 }
 
 PALPATE void invert_there(const Envelope& L, const Envelope& Z, int*, double* column) {
@@ -174,6 +243,7 @@ PALPATE bool factorize(const Envelope& A, double* u) {
   return true;
 }
 
+template <int ROWS>
 CALLED void solve_factorized(const Envelope& L, double* b) {
   for (int i = 0; i < L.n; ++i) {
     const int lo = L.first[i];

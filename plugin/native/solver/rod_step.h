@@ -56,14 +56,25 @@ struct RodRow {
   }
 };
 
-// Adds force J to a gradient by place, and stiffness J J^T to the matrix; B is J of what yields to row `at`.
+// Adds force J to a gradient by place, and stiffness J J^T to the matrix; B is J of what yields to row `at`. All lanes do
+// so together.
 template <class Fields>
 PALPATE void add_row(
     const Fields& f, const RodRow<Fields>& at, const double* J, const double* B, double force, double stiffness, double* g,
     const RodMatrix* H) {
+  const int node = at.node();
+#if ON_CUDA
+  const auto value = [&](int a) { return a < DOFS ? J[a] : B[a - DOFS]; };
+  const auto which = [&](int a) { return a < DOFS ? node + a / 3 : at.body() + (a - DOFS) / 3; };
+  const int count = at.body() < 0 ? DOFS : DOFS + REACH;
+  each_lane(0, count, [&](int a) {
+    if (value(a) != 0.0) g[4 * which(a) + a % 3] += force * value(a);
+  });
+  add_together(*H, count, [&](int a) { return H->of(which(a), a % 3); },
+               [&](int a, int b) { return stiffness * value(a) * value(b); });
+#else
   Terms<2> terms;
   terms.add(J, force, stiffness);
-  const int node = at.node();
   const int last = node + 1 < f.nnode ? node + 1 : node - 1;  // at the end, of which there is nothing
   const int nodes[2] = {node, last};
   terms.scatter(nodes, g, *H);
@@ -77,6 +88,7 @@ PALPATE void add_row(
     for (int k = 0; k <= i; ++k)
       H->add(body, 3, at.body() + k, 3, [&](int c, int d) { return stiffness * b[c] * B[3 * k + d]; });
   }
+#endif
 }
 
 // The cost of a cone (MuJoCo, Computation, elliptic cones) whose first row is r; adds its gradient and
@@ -131,30 +143,25 @@ template <class Fields>
 CALLED double rows_cost(const Fields& f, const double* x, double h, double* g, const RodMatrix* H) {
   double cost = 0.0;
   const int n = f.count.data[0];
-  const auto add = [&](int r) {
+  const auto cost_of = [&](int r, double* into) {
     const RodRow<Fields> row{f, r};
-    if (row.kind() == FRICTION) return;  // of the cone before
+    if (row.kind() == FRICTION) return 0.0;  // of the cone before
     if (row.kind() == CONE) {
       int dim = 1;
       while (r + dim < n && f.row_kind.data[r + dim] == FRICTION) ++dim;
-      cost += cone(f, r, dim, x, h, g, H);
-      return;
+      return cone(f, r, dim, x, h, into, H);
     }
     const double residual = row.residual(x, h);
-    if (row.kind() == ONE && residual >= 0.0) return;
-    cost += 0.5 * row.D() * residual * residual;
-    if (g) add_row(f, row, row.J(), row.B(), row.D() * residual, row.D() / (h * h), g, H);
+    if (row.kind() == ONE && residual >= 0.0) return 0.0;
+    if (into) add_row(f, row, row.J(), row.B(), row.D() * residual, row.D() / (h * h), into, H);
+    return 0.5 * row.D() * residual * residual;
   };
   if (!g || TOGETHER == 1) {
-    each_lane(0, n, add);
-  } else {  // by the nodes that they reach; those of the last one have the one before as well
-    each_apart<3>(0, f.nnode, [&](int i) {
-      for (int r = 0; r < n; ++r)
-        if (f.row_node.data[r] == i && f.row_yields.data[r] < 0) add(r);
-    });
-    one_lane([&] {
-      for (int r = 0; r < n; ++r)
-        if (f.row_yields.data[r] >= 0) add(r);
+    each_lane(0, n, [&](int r) { cost += cost_of(r, g); });
+  } else {
+    each_in_turn<int>(n, [&](int r, int& own) { return own = r, cost_of(r, nullptr) > 0.0; }, [&](int r) {
+      const double own = cost_of(r, g);
+      if (own_lane() == 0) cost += own;
     });
   }
   return cost;
@@ -180,7 +187,7 @@ CALLED double step_cost(const Fields& f, const double* x, const double* turn, do
 // The gradient at a trial state, and the matrix, see `add_rod`; both without what other bodies do.
 template <class Fields>
 PALPATE void assemble(const Fields& f, const double* x, const double* turn, double h, double* g, bool exact) {
-  one_lane([&] { lay_out(f, x); });
+  lay_out(f, x);
   const RodMatrix H = matrix_of(f);
   each_lane(0, f.count.data[2], [&](int a) { H.value[a] = 0.0; });
   each_lane(0, f.nnode, [&](int i) {
@@ -203,16 +210,14 @@ PALPATE void assemble(const Fields& f, const double* x, const double* turn, doub
 // Takes unknowns out that do not change.
 template <class Fields>
 PALPATE void hold(const Fields& f, double* g, const RodMatrix& H) {
-  int count = 0;
   int* held = f.below.data;
-  for (int i = 0; i < f.nnode; ++i) {
-    for (int c = 0; c < 4; ++c) {
-      if (!f.held.data[4 * i + c]) continue;
-      g[4 * i + c] = 0.0;
-      if (c < H.per) held[count++] = H.of(i, c);  // by all lanes alike
-    }
-  }
-  meet_lanes();
+  const int count = each_after(4 * f.nnode, [&](int a, int at) {
+    if (!f.held.data[a]) return 0;
+    g[a] = 0.0;
+    if (a % 4 >= H.per) return 0;
+    if (at >= 0) held[at] = H.of(a / 4, a % 4);
+    return 1;
+  });
   if (!count) return;
   each_lane(0, H.n, [&](int a) {
     for (int k = 0; k < count; ++k)
@@ -238,7 +243,8 @@ PALPATE void solve_nodes(const Fields& f, double* b) {
   each_lane(0, nodes_of(f), [&](int i) {
     for (int c = 0; c < H.per; ++c) y[H.of(i, c)] = b[4 * i + c];
   });
-  solve_factorized(H, y);
+  if (f.twists) solve_factorized<4>(H, y);
+  else solve_factorized<3>(H, y);
   each_lane(0, nodes_of(f), [&](int i) {
     for (int c = 0; c < 4; ++c) b[4 * i + c] = c < H.per ? y[H.of(i, c)] : 0.0;
   });
@@ -265,20 +271,16 @@ PALPATE int step_rod(const Fields& f, double h) {
   double* trial = f.trial.data;
   double* trial_turn = f.trial.data + 3 * n;
   const double reach = reach_of(f, h);
-  one_lane([&] {
-    f.reach.data[0] = reach;
-    list_pairs(f, f.start.data);
-    note_pressure(f);
-  });
+  one_lane([&] { f.reach.data[0] = reach; });
+  list_pairs(f, f.start.data);
+  note_pressure(f);
   predict(f, h);
   double cost = step_cost(f, x, turn, h);
   int iteration = 0;
   for (; iteration < f.newton; ++iteration) {
     if (is_stale(f, x)) {
-      one_lane([&] {
-        list_pairs(f, x);
-        note_pressure(f);
-      });
+      list_pairs(f, x);
+      note_pressure(f);
       cost = step_cost(f, x, turn, h);
     }
     const RodMatrix H = matrix_of(f);

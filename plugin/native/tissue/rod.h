@@ -119,6 +119,18 @@ struct RodMatrix : Envelope {
   }
 };
 
+#if ON_CUDA
+// Adds value(a, b) for each two of `count` unknowns, whose numbers in the matrix are of(a), by all lanes together.
+template <class Of, class Value>
+PALPATE void add_together(const RodMatrix& H, int count, Of of, Value value) {
+  each_lane(0, count * (count + 1) / 2, [&](int pair) {
+    const Corner at = corner(pair);
+    const double more = value(at.row, at.column);
+    if (more != 0.0) H.at(of(at.row), of(at.column)) += more;
+  });
+}
+#endif
+
 // What nodes add to the gradient, and to the matrix: the places of each, not its turn.
 template <int NODES>
 struct Terms {
@@ -152,6 +164,15 @@ struct Terms {
       for (int m = 0; m <= k; ++m)
         H.add(node[k], 3, node[m], 3, [&](int c, int d) { return K[3 * k + c][3 * m + d]; });
     }
+  }
+  // The same where all lanes have these terms.
+  PALPATE void scatter_together(const int* node, double* into, const RodMatrix& H) const {
+#if ON_CUDA
+    each_lane(0, COUNT, [&](int a) { into[4 * node[a / 3] + a % 3] += g[a]; });
+    add_together(H, COUNT, [&](int a) { return H.of(node[a / 3], a % 3); }, [&](int a, int b) { return K[a][b]; });
+#else
+    scatter(node, into, H);
+#endif
   }
 };
 

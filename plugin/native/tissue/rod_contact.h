@@ -75,12 +75,13 @@ PALPATE double reach_of(const Fields& f, double h) {
 template <class Fields>
 CALLED bool list_near(const Fields& f, const double* x) {
   const int n = f.nnode;
-  int count = 0;
   const double far = 2.0 * f.radius + f.reach.data[0], reach = far + f.longest;
-  bool whole = true;
-  for (int i = 0; i + 1 < n; ++i) whole = whole && is_whole(f, i);
-  for (int i = 0; i + 1 < n; ++i) {
-    if (!is_whole(f, i)) continue;
+  double broken = 0.0;
+  each_lane(0, n - 1, [&](int i) { broken += is_whole(f, i) ? 0.0 : 1.0; });
+  const bool whole = sum_together(broken) == 0.0;
+  const int count = each_after(n - 1, [&](int i, int at) {
+    if (!is_whole(f, i)) return 0;
+    int own = 0;
     const D3 a = 0.5 * (load(x + 3 * i) + load(x + 3 * i + 3));
     const double beyond = f.along.data[i + 1] + NEIGHBOURS * f.radius;
     for (int j = i + 2, skip; j + 1 < n && f.collides; j += skip) {
@@ -94,14 +95,17 @@ CALLED bool list_near(const Fields& f, const double* x) {
       }
       const D3 off = nearest_edges(x, i, j).off;
       if (dot(off, off) > far * far) continue;
-      if (count >= f.most_pairs) return false;
-      f.pair.data[2 * count] = i;
-      f.pair.data[2 * count + 1] = j;
-      ++count;
+      if (at >= 0 && at + own < f.most_pairs) {
+        f.pair.data[2 * (at + own)] = i;
+        f.pair.data[2 * (at + own) + 1] = j;
+      }
+      ++own;
     }
-  }
-  f.count.data[1] = count;
-  for (int a = 0; a < 3 * n; ++a) f.listed.data[a] = x[a];
+    return own;
+  });
+  if (count > f.most_pairs) return false;
+  one_lane([&] { f.count.data[1] = count; });
+  each_lane(0, 3 * n, [&](int a) { f.listed.data[a] = x[a]; });
   return true;
 }
 
@@ -129,15 +133,15 @@ PALPATE int nodes_of(const Fields& f) { return f.nnode + f.count.data[3]; }
 template <class Fields, class Join>
 PALPATE void join_bodies(const Fields& f, Join join) {
   const int last = nodes_of(f);
-  for (int i = f.nnode; i < last; ++i) join(i, i);
-  for (int r = 0; r < f.count.data[0]; ++r) {
+  each_lane(f.nnode, last, [&](int i) { join(i, i); });
+  each_lane(0, f.count.data[0], [&](int r) {
     const int first = f.row_yields.data[r];
     for (int body = first; first >= 0 && body < last && body < first + REACH / 3; ++body) {
       join(body, f.row_node.data[r]);
       if (f.row_node.data[r] + 1 < f.nnode) join(body, f.row_node.data[r] + 1);
       for (int other = first; other < body; ++other) join(body, other);
     }
-  }
+  });
 }
 
 // Orders the nodes so that those that have to do with each other are near: next comes, of those that a
@@ -146,56 +150,58 @@ template <class Fields>
 CALLED void order_nodes(const Fields& f, const double* x) {
   const int n = nodes_of(f), words = (n + 31) / 32;
   unsigned* near = (unsigned*)f.near.data;
-  const auto mark = [&](unsigned* row, int i) { row[i / 32] |= 1u << (i % 32); };
+  const auto mark = [&](unsigned* row, int i) { set_bits(row[i / 32], 1u << (i % 32)); };
   const auto has = [&](const unsigned* row, int i) { return row[i / 32] >> (i % 32) & 1; };
-  for (int a = 0; a < n * words; ++a) near[a] = 0;
+  each_lane(0, (n + 1) * words, [&](int a) { near[a] = 0; });
   const auto join = [&](int i, int j) {
     mark(near + i * words, j);
     mark(near + j * words, i);
   };
-  for (int i = 0; i < f.nnode; ++i)
+  each_lane(0, f.nnode, [&](int i) {
     for (int j = i; j < f.nnode && j < i + 3; ++j) join(i, j);
+  });
   join_bodies(f, join);
-  for (int p = 0; p < f.count.data[1]; ++p) {
+  each_lane(0, f.count.data[1], [&](int p) {
     const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
-    if (!may_be_near(f, x, i, j, 2.5 * f.radius) || norm(nearest_edges(x, i, j).off) > 2.5 * f.radius) continue;
+    if (!may_be_near(f, x, i, j, 2.5 * f.radius) || norm(nearest_edges(x, i, j).off) > 2.5 * f.radius) return;
     for (int a = i; a < i + 2; ++a)
       for (int b = j; b < j + 2; ++b) join(a, b);
-  }
+  });
   unsigned* seen = near + n * words;  // what a node before has to do with, and these
   int* front = f.below.data;          // those of them that have no rank yet
-  for (int a = 0; a < words; ++a) seen[a] = 0;
-  int count = 0, next = 0;
-  for (int rank = 0; rank < n; ++rank) {
-    int best = -1, fewest = n + 1;
-    for (int k = 0; k < count; ++k) {
-      int adds = 0;
-      for (int a = 0; a < words; ++a) adds += bits(near[front[k] * words + a] & ~seen[a]);
-      if (adds < fewest) fewest = adds, best = k;
+  one_lane([&] {
+    int count = 0, next = 0;
+    for (int rank = 0; rank < n; ++rank) {
+      int best = -1, fewest = n + 1;
+      for (int k = 0; k < count; ++k) {
+        int adds = 0;
+        for (int a = 0; a < words; ++a) adds += bits(near[front[k] * words + a] & ~seen[a]);
+        if (adds < fewest) fewest = adds, best = k;
+      }
+      int node;
+      if (best < 0) {
+        while (has(seen, next)) ++next;
+        node = next;
+        seen[node / 32] |= 1u << (node % 32);
+      } else {
+        node = front[best];
+        for (int k = best; k + 1 < count; ++k) front[k] = front[k + 1];
+        --count;
+      }
+      f.rank.data[node] = rank;
+      for (int a = 0; a < words; ++a) {
+        unsigned adds = near[node * words + a] & ~seen[a];
+        seen[a] |= adds;
+        for (; adds; adds &= adds - 1) front[count++] = 32 * a + lowest_bit(adds);
+      }
     }
-    int node;
-    if (best < 0) {
-      while (has(seen, next)) ++next;
-      node = next;
-      mark(seen, node);
-    } else {
-      node = front[best];
-      for (int k = best; k + 1 < count; ++k) front[k] = front[k + 1];
-      --count;
-    }
-    f.rank.data[node] = rank;
-    for (int a = 0; a < words; ++a) {
-      unsigned adds = near[node * words + a] & ~seen[a];
-      seen[a] |= adds;
-      for (; adds; adds &= adds - 1) front[count++] = 32 * a + lowest_bit(adds);
-    }
-  }
+  });
 }
 
 // Lists pairs, as far away as there is room, and orders the nodes.
 template <class Fields>
 PALPATE void list_pairs(const Fields& f, const double* x) {
-  while (!list_near(f, x)) f.reach.data[0] *= 0.5;
+  while (!list_near(f, x)) one_lane([&] { f.reach.data[0] *= 0.5; });
   order_nodes(f, x);
 }
 
@@ -206,7 +212,7 @@ PALPATE int unknowns_of(const Fields& f) { return f.twists ? 4 : 3; }
 template <class Fields>
 PALPATE RodMatrix matrix_of(const Fields& f) {
   const int per = unknowns_of(f);
-  return {{f.matrix.data, f.first.data, f.start_of_row.data, per * nodes_of(f)}, f.rank.data, per};
+  return {{f.matrix.data, f.first.data, f.start_of_row.data, f.last.data, per * nodes_of(f)}, f.rank.data, per};
 }
 
 // The rows' first columns: of two neighbours along the rod, and of what touches at x or began the step so.
@@ -215,32 +221,33 @@ PALPATE void lay_out(const Fields& f, const double* x) {
   const int n = nodes_of(f), per = unknowns_of(f);
   const int* rank = f.rank.data;
   int* lowest = f.below.data;  // rank of what a node has to do with
-  for (int i = 0; i < n; ++i) lowest[i] = rank[i];
+  each_lane(0, n, [&](int i) { lowest[i] = rank[i]; });
   const auto join = [&](int i, int j) {
-    if (rank[i] < lowest[j]) lowest[j] = rank[i];
-    if (rank[j] < lowest[i]) lowest[i] = rank[j];
+    lower(lowest[j], rank[i]);
+    lower(lowest[i], rank[j]);
   };
-  for (int i = 0; i < f.nnode; ++i)
+  each_lane(0, f.nnode, [&](int i) {
     for (int j = i + 1; j < f.nnode && j < i + 3; ++j) join(i, j);
+  });
   join_bodies(f, join);
-  for (int p = 0; p < f.count.data[1]; ++p) {
+  each_lane(0, f.count.data[1], [&](int p) {
     const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
     if (!(f.pressure.data[p] > 0.0)) {
-      if (!may_be_near(f, x, i, j, 2.0 * f.radius)) continue;
+      if (!may_be_near(f, x, i, j, 2.0 * f.radius)) return;
       const D3 off = nearest_edges(x, i, j).off;
-      if (dot(off, off) >= 4.0 * f.radius * f.radius) continue;
+      if (dot(off, off) >= 4.0 * f.radius * f.radius) return;
     }
     for (int a = i; a < i + 2; ++a)
       for (int b = j; b < j + 2; ++b) join(a, b);
-  }
-  for (int i = 0; i < n; ++i)
+  });
+  each_lane(0, n, [&](int i) {
     for (int c = 0; c < per; ++c) f.first.data[per * rank[i] + c] = per * lowest[i];
-  int at = 0;
-  for (int a = 0; a < per * n; ++a) {
-    f.start_of_row.data[a] = at;
-    at += a - f.first.data[a] + 1;
-  }
-  f.count.data[2] = at;
+  });
+  const int entries = each_after(per * n, [&](int a, int at) {
+    if (at >= 0) f.start_of_row.data[a] = at;
+    return a - f.first.data[a] + 1;
+  });
+  one_lane([&] { f.count.data[2] = entries; });
 }
 
 // Adds what a force between two edges does as they turn and as their nearest points move: the second derivative
@@ -344,7 +351,7 @@ CALLED double contacts_energy(const Fields& f, const double* x, double h, double
     }
     return g != nullptr;
   };
-  each_in_turn<PairTerms>(f.count.data[1], add_pair, [&](const PairTerms& own) { own.terms.scatter(own.node, g, *H); });
+  each_in_turn<PairTerms>(f.count.data[1], add_pair, [&](const PairTerms& own) { own.terms.scatter_together(own.node, g, *H); });
   return sum;
 }
 
@@ -352,8 +359,8 @@ CALLED double contacts_energy(const Fields& f, const double* x, double h, double
 // nearer than can be, as where a state was set so: they do not meet until they are apart.
 template <class Fields>
 CALLED void note_pressure(const Fields& f) {
-  f.smooth.data[0] = f.slow;
-  for (int p = 0; p < f.count.data[1]; ++p) {
+  double fastest = f.slow;
+  each_lane(0, f.count.data[1], [&](int p) {
     const Nearest at = nearest_edges(f.start.data, f.pair.data[2 * p], f.pair.data[2 * p + 1]);
     const double distance = norm(at.off);
     const Barrier b = barrier(f, distance);
@@ -363,8 +370,10 @@ CALLED void note_pressure(const Fields& f) {
     touch[1] = at.t;
     store(touch + 2, unit(at.off));
     const double slides = SMOOTH * norm(slid(f, p, f.vel.data));
-    if (f.pressure.data[p] > 0.0 && slides > f.smooth.data[0]) f.smooth.data[0] = slides;
-  }
+    if (f.pressure.data[p] > 0.0 && slides > fastest) fastest = slides;
+  });
+  fastest = most_together(fastest);
+  one_lane([&] { f.smooth.data[0] = fastest; });
 }
 
 // How far nodes have moved since pairs were listed, at most.
