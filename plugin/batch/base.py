@@ -311,6 +311,20 @@ class Batch(abc.ABC):
   def _place(self, body: int, pos: Any, quat: Any, mask: wp.array):
     """Moves a body."""
 
+  def switch(self, equality: str, active):
+    """Switches an equality on or off in each world; resets and states do so too.
+
+    Args:
+      equality: name
+      active: whether it is on, (nworld,) of bool, here or on the device
+    """
+    number = _named(self.model.equality, "equality", equality).id
+    self._switch(number, self.checked(active, "active"))
+
+  @abc.abstractmethod
+  def _switch(self, equality: int, active: wp.array):
+    """Switches an equality."""
+
   def _rows(self, values, name: str, count: int) -> Any:
     if not (isinstance(values, wp.array) and self.device.is_cuda):
       values = np.asarray(values, float)
@@ -345,7 +359,7 @@ class Batch(abc.ABC):
   def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
     """Changes some worlds; values have a row for each of these."""
 
-  def checked(self, mask) -> wp.array:
+  def checked(self, mask, name: str = "mask") -> wp.array:
     """Returns a mask of worlds on the device, all of them for None; refuses what is none."""
     if mask is None:
       return wp.full(self.nworld, True, dtype=wp.bool, device=self.device)
@@ -354,7 +368,7 @@ class Batch(abc.ABC):
     kind = getattr(mask.dtype, "__name__", str(mask.dtype)).rpartition(".")[2]
     if tuple(mask.shape) != (self.nworld,) or kind != "bool":
       what = f"shape {tuple(mask.shape)} of {kind}"
-      raise ValueError(f"mask has {what}, expected ({self.nworld},) of bool, one a world")
+      raise ValueError(f"{name} has {what}, expected ({self.nworld},) of bool, one a world")
     return on_device(mask, wp.bool, self.device)
 
   def index(self, world: int) -> int:

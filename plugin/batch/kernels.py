@@ -44,6 +44,13 @@ def place(m: Move):
 
 
 @wp.kernel(enable_backward=False)
+def switch(active: wp.array[bool], equality: int, eq_active: wp.array2d[bool]):
+  """Switches an equality in each world."""
+  w = wp.tid()
+  eq_active[w, equality] = active[w]
+
+
+@wp.kernel(enable_backward=False)
 def put_back(m: Move):
   """Puts geoms of the worlds that are not of the mask where they were."""
   w, g = wp.tid()

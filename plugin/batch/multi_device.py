@@ -121,6 +121,10 @@ class Several(Batch):
     for part, at, own in self._each(mask):
       part._pose(adr, values[at], own)
 
+  def _switch(self, equality: int, active: wp.array):
+    for part, _, own in self._each(active):
+      part._switch(equality, own)
+
   def _place(self, body: int, pos: Any, quat: Any, mask: wp.array):
     for part, at, own in self._each(mask):
       part._place(body, pos[at], quat[at], own)

@@ -65,6 +65,7 @@ class Rest:
     self._move = move = kernels.Move()
     for name, array in arrays_of(kernels.Move, batch.m, d).items():
       setattr(move, name, array)
+    self._places: dict[bytes, wp.array] = {}
     move.mask, move.xpos, move.xmat = batch.mask, wp.clone(d.geom_xpos), wp.clone(d.geom_xmat)
 
   def launch(self):
@@ -77,8 +78,10 @@ class Rest:
 
   def pose(self, at: np.ndarray, values):
     """Puts joints of the worlds of the mask at positions; `at` has their places."""
-    move, device = self._move, self.batch.device
-    move.at = wp.array(at, dtype=int, device=device)
+    move, device, key = self._move, self.batch.device, at.tobytes()
+    if key not in self._places:  # a graph that is being recorded cannot take them to the device
+      self._places[key] = wp.array(at, dtype=int, device=device)
+    move.at = self._places[key]
     move.values = on_device(values, wp.float32, device)
     wp.launch(kernels.pose, dim=values.shape, inputs=[move], device=device)
 

@@ -145,6 +145,10 @@ class Threads(Batch):
       data = self.datas[world]
       data.qpos[adr[:, 0]], data.qvel[adr[:, 1]] = values[world], 0.0
 
+  def _switch(self, equality: int, active: wp.array):
+    for data, on in zip(self.datas, active.numpy(), strict=True):
+      data.eq_active[equality] = on
+
   def _place(self, body: int, pos: np.ndarray, quat: np.ndarray, mask: wp.array):
     for world in np.flatnonzero(mask.numpy()):
       model = self.models[world]

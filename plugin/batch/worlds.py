@@ -311,7 +311,7 @@ class Worlds(Batch):
   def _run(self, name: str):
     graph, work = self._graphs[name]
     with wp.ScopedDevice(self.device):
-      if graph is None:
+      if graph is None or self.device.is_capturing:  # a graph launches no other
         work()
       else:
         wp.capture_launch(graph)
@@ -345,6 +345,10 @@ class Worlds(Batch):
     wp.copy(self.mask, mask)
     self._rest.pose(np.stack(at, 1), values)
     self._run("look")
+
+  def _switch(self, equality: int, active: wp.array):
+    inputs = [active, equality, self.d.eq_active]
+    wp.launch(kernels.switch, dim=self.nworld, inputs=inputs, device=self.device)
 
   def _place(self, body: int, pos: np.ndarray, quat: np.ndarray, mask: wp.array):
     wp.copy(self.mask, mask)

@@ -165,13 +165,19 @@ class Episodes:
     frame["reference"] = np.array(self._task.reference_length() or 0.0)
     task = self._task
     frame |= dict(self._draw_own(task)) | dict(task.tissue())
-    return frame | task.joints | task.bodies | task.threads
+    put = task.joints | task.bodies | task.threads
+    return frame | {put_row(name): row for name, row in put.items()}
 
 
 def of_physics(physics: Any) -> dict[str, Any]:
   """Returns the instruments of a scene by what the names of their rows begin with."""
   all_of = {"": physics, "other_": physics.second, "guided_": physics.guided}
   return {which: hand for which, hand in all_of.items() if hand}
+
+
+def put_row(name: str) -> str:
+  """Returns the name of the row of where a joint, body or thread is put."""
+  return f"put_{name}"
 
 
 def rows_of(which: str) -> list[str]:

@@ -93,6 +93,10 @@ class Common:
   views: Array(wp.mat33, (VIEWS,))  # frames that the thread is seen in
   crossing: floats("nworld", "ncrossing", 3)  # over and under, along the thread; its sign
   relation: doubles("nworld", "ncrossing", "ncrossing")  # scratch
+  # Of the needle, see `rules.fasten` and `rules.put_away`.
+  fastened: flags  # whether it is on its thread
+  gone: flags  # whether it is put somewhere
+  away: floats("nworld", 7)  # where [m], and its orientation, w x y z
   # Of the other hand.
   other_tip_pos: floats("nworld", 3)
   other_tip_quat: floats("nworld", 4)

@@ -24,10 +24,11 @@ class States:
     observe: kernel (fields, records, beginning)
     act: the same of what an action does besides, or None
     begin: the same of what follows the beginning of an episode, or None
+    words: what the rules are written in, functions of `tasks.core.rules` among them
   """
 
   def __init__(self, own: Rules, task: Any, nworld: int, device: Any):
-    self.kind, self.advance, self.observe, self.act, self.begin = compiled(own)
+    self.kind, self.advance, self.observe, self.act, self.begin, self.words = compiled(own)
     self._fields, self._dtype = own.fields, self.kind.numpy_dtype()
     self._dtype = np.dtype(self._dtype)
     self.rows: dict[str, wp.array] = {}

@@ -137,6 +137,29 @@ def taut(s: Common):
 
 
 @word
+def tugged(s: Common, count: int):
+  least = s.tension[s.world, 0]
+  for k in range(1, count):
+    least = wp.min(least, s.tension[s.world, k])
+  return least
+
+
+@word
+def fasten(s: Common, o: Any, on: bool):
+  s.fastened[s.world] = on
+
+
+@word
+def put_away(s: Common, place: wp.vec3):
+  w = s.world
+  s.gone[w] = True
+  for k in range(3):
+    s.away[w, k] = place[k]
+  for k in range(3, 7):
+    s.away[w, k] = s.qpos[w, s.needle + k]
+
+
+@word
 def jaws(s: Common, hand: int):
   if hand == 0:
     return s.gripper[s.world, 0], s.gripper[s.world, 1]
@@ -339,24 +362,26 @@ def visible(s: Common, o: Any):
   return seen / float(s.behind.shape[1])
 
 
-def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:
+def translate(rule: Any, module: Any, known: dict[Any, Any], used: set[Any]) -> Any:
   """Returns a rule as a Warp function, with those that it calls and with the words of many worlds.
 
   Args:
     rule: plain function
     module: of Warp, that it is compiled in
     known: functions that are translated already
+    used: takes those that are met
   """
+  used.add(rule)
   if rule in known:
     return known[rule]
   if rule in rules.INSTEAD:
-    known[rule] = translate(rules.INSTEAD[rule], module, known)
+    known[rule] = translate(rules.INSTEAD[rule], module, known, used)
     return known[rule]
   names = dict(rule.__globals__)
-  used = (step.argval for step in dis.get_instructions(rule) if step.opname == "LOAD_GLOBAL")
-  for name in used:
+  loaded = (step.argval for step in dis.get_instructions(rule) if step.opname == "LOAD_GLOBAL")
+  for name in loaded:
     if isinstance(names.get(name), types.FunctionType):
-      names[name] = translate(names[name], module, known)
+      names[name] = translate(names[name], module, known, used)
   code = rule.__code__
   copy = types.FunctionType(code, names, rule.__name__, rule.__defaults__, rule.__closure__)
   copy.__annotations__ = dict.fromkeys(code.co_varnames[: code.co_argcount], Any)
@@ -368,15 +393,15 @@ def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:
 
 
 @functools.cache
-def compiled(own: Rules) -> tuple[Any, Any, Any, Any, Any]:
-  """Returns the struct of a domain's state, and the kernels of its rules."""
-  module, known = wp.get_module(own.state.__module__), dict(WORDS)
+def compiled(own: Rules) -> tuple[Any, Any, Any, Any, Any, set[Any]]:
+  """Returns the struct of a domain's state, the kernels of its rules, and the words in these."""
+  module, known, used = wp.get_module(own.state.__module__), dict(WORDS), set[Any]()
   kinds = {
     name: wp.array(dtype=kind.dtype, ndim=len(kind.dims)) if isinstance(kind, Array) else kind
     for name, kind in own.fields.items()
   }
   state: Any = wp.struct(type("State", (), {"__annotations__": kinds, "__module__": module.name}))
-  rule, shaping = (translate(found, module, known) for found in (own.advance, own.shaping))
+  rule, shaping = (translate(found, module, known, used) for found in (own.advance, own.shaping))
   judge = kernels.judge
 
   def advance(s: Common, states: wp.array(dtype=state)):
@@ -397,9 +422,9 @@ def compiled(own: Rules) -> tuple[Any, Any, Any, Any, Any]:
     return wp.kernel(follow, module=module, enable_backward=False)
 
   after = wp.kernel(advance, module=module, enable_backward=False)
-  look = following("observe", translate(own.observe, module, known))
+  look = following("observe", translate(own.observe, module, known, used))
   act, begin = (
-    following(name, translate(rule, module, known)) if rule else None
+    following(name, translate(rule, module, known, used)) if rule else None
     for name, rule in (("act", own.act), ("begin", own.begin))
   )
-  return state, after, look, act, begin
+  return state, after, look, act, begin, used

@@ -12,7 +12,7 @@ import palpate.batch
 import warp as wp
 from palpate.batch.threads import Threads
 from palpate.models import trocar
-from palpate.tasks.core import episode, jaws
+from palpate.tasks.core import episode, jaws, rules
 from palpate.tasks.core.environment import Environment
 from palpate.tasks.core.instrument import AROUND, DRIVE_RATES, FIFTH, FORCES, TOUCH, axes, jawed
 from palpate.tasks.core.scenes import GUIDED
@@ -20,7 +20,7 @@ from palpate.tasks.core.stage import STATE
 from palpate.tissue.types import allocate
 
 from . import kernels, tally, throws
-from .episodes import FRAME, HAND, Episodes, at_rest, of_physics, rows_of
+from .episodes import FRAME, HAND, Episodes, at_rest, of_physics, put_row, rows_of
 from .fields import OBSERVED, Common
 from .pictures import Pictures
 from .states import States
@@ -172,6 +172,17 @@ class Worlds:
       (thread,) = self.batch.threads.values()
       thread.hold(name, s.held_node[k], s.held_place[k], s.held_firm[k])
 
+  def _move_needle(self) -> None:
+    """Lets the needle be on its thread, or off it, and where rules put it."""
+    s, words = self.fields, self.states.words
+    if rules.fasten in words:
+      (thread,) = self.batch.threads
+      self.batch.switch(f"needle_{thread}", s.fastened)
+    if rules.put_away in words:
+      self.batch.pose(["needle"], s.away, s.gone)
+      s.gone.zero_()
+      self._read(s)
+
   def _count(self, task: Any) -> Any:
     """Returns the sums that metrics are made of."""
     t = allocate(tally.Tally, self.device, {"nworld": self.nworld})
@@ -317,6 +328,7 @@ class Worlds:
       self.launch(kernels.hide, self.fields.behind.shape, [self.fields])
     self._over(self.states.advance, self.states.records)
     self._hold()
+    self._move_needle()
     self._over(tally.add, self.tally)
     if self.other:
       self.launch(tally.add, self.nworld, [self.other, self._tally])
@@ -379,13 +391,13 @@ class Worlds:
         self.batch.place(f"{of}trocar", pos, quat, s.begun)
       self.batch.pose([of + axis for axis in axes(of)], pose, s.begun)
     for name in self.task.bodies:
-      row = rows[name]
+      row = rows[put_row(name)]
       self.batch.place(name, row[:, :3], row[:, 3:], s.begun)
     if self.task.joints:
-      values = np.concatenate([rows[name] for name in self.task.joints], axis=1)
+      values = np.concatenate([rows[put_row(name)] for name in self.task.joints], axis=1)
       self.batch.pose([*self.task.joints], values, s.begun)
     for name in self.task.threads:
-      self.batch.thread(name).lay(rows[name], s.begun)
+      self.batch.thread(name).lay(rows[put_row(name)], s.begun)
     if self._tissue:
       self.organ.configure(mask, **{key: rows[key] for key in self._tissue})
     self.run(self._open)
@@ -411,6 +423,7 @@ class Worlds:
     if self.states.begin:
       self._over(self.states.begin, self.states.records, True)
       self._hold()
+      self._move_needle()
     self._over(tally.start, self.tally)
     if self.other:
       self.launch(tally.start, self.nworld, [self.other, self._tally])

@@ -292,6 +292,25 @@ def taut(s: Any) -> float:
   return float(s.thread.tension.max())
 
 
+def tugged(s: Any, count: int) -> float:
+  """Returns the least tension of so many of the thread's first edges [N]."""
+  return float(s.thread.tension[:count].min())
+
+
+def fasten(s: Any, o: Any, on: bool) -> None:
+  """Fastens the needle to its thread, or takes it off that, which it reports."""
+  which = s.model.ptr.equality(f"needle_{s.thread.name}").id
+  s.data.ptr.eq_active[which] = on
+  if not on:
+    o.event(s, "note", label="needle off its thread")
+
+
+def put_away(s: Any, place: np.ndarray) -> None:
+  """Puts the free body `needle` at a place, at rest [m]."""
+  joint = s.data.ptr.joint("needle")
+  joint.qpos[:3], joint.qvel[:] = place, 0.0
+
+
 def jaws(s: Any, hand: int) -> tuple[float, float]:
   """Returns the opening of a hand's jaws, and what they are told [rad]."""
   opening, target = s.hands[hand].gripper()[:2]

@@ -1,10 +1,11 @@
 """A stitch that two hands place and tie: what holds the needle, what counts, and what fails."""
 
+import dm_env
 import mujoco
 import numpy as np
 import pytest
+from devices import needs_cuda
 from palpate.tasks import suite
-from palpate.tasks.batch.vector import Exercises, NotVectorisedError
 from palpate.tasks.core import episode, performer
 from palpate.tasks.domains.suturing import drain
 from palpate.tasks.metrics import knots
@@ -109,6 +110,105 @@ def test_the_needle_comes_off_by_a_tug_and_is_taken_away_once_it_is_let_go():
   assert np.linalg.norm(step.observation["needle"]) > 0.05
 
 
-def test_batches_refuse_it():
-  with pytest.raises(NotVectorisedError, match="rules of Stitch is None"):
-    Exercises(num_envs=1, task="suture/stitch_easy", device="cpu")
+DEVICES = [
+  "cpu",
+  pytest.param("warp-cpu", marks=pytest.mark.slow),
+  pytest.param("cuda:0", marks=needs_cuda),
+]
+
+
+def beside(num_envs, device):
+  """Returns worlds, single environments, and what both observe as episodes of seeds 3, 4 begin."""
+  gymnasium = pytest.importorskip("gymnasium")
+  name, options = "palpate/SutureStitchEasy-v0", {"surroundings": "none"}
+  envs = gymnasium.make_vec(name, num_envs=num_envs, device=device, **options)
+  alone = [
+    gymnasium.make(name, disable_env_checker=True, record=True, **options) for _ in range(num_envs)
+  ]
+  seen = envs.reset(seed=3)[0]
+  return envs, alone, seen, [env.reset(seed=3 + k)[0] for k, env in enumerate(alone)]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_many_worlds_drive_the_needle_or_drop_it_as_one_does(device):
+  envs, alone, seen, expected = beside(2, device)
+  env, ended = alone[0].unwrapped.environment, None
+  act, step = performer.make(env), dm_env.restart(expected[0])
+  for _ in range(100):
+    for name in ("target", "circle", "needle", "right_holds", "left_holds", "pierced", "attached"):
+      np.testing.assert_allclose(seen[name][0], expected[0][name], atol=1e-3, err_msg=name)
+    actions = np.stack([act(step), still(alone[1].unwrapped.environment, jaw=OPEN)])
+    seen, _, terminated, _, info = envs.step(actions.astype(np.float32))
+    expected[0] = alone[0].step(actions[0])[0]
+    step = dm_env.transition(0.0, expected[0])
+    if ended is None:
+      _, _, over, _, told = alone[1].step(actions[1])
+      assert terminated.tolist() == [False, over]
+      if over:
+        ended = told["outcome"]
+        assert info["final_info"]["outcome"][1] == ended == "missed"
+    if expected[0]["pierced"] == 2.0:
+      break
+  assert ended == "missed" and seen["pierced"][0] == 2.0
+  envs.close()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_in_many_worlds_the_needle_comes_off_where_it_is_tugged(device):
+  envs, alone, _, _ = beside(2, device)
+  rest = np.stack([still(env.unwrapped.environment) for env in alone])
+  for _ in range(3):
+    envs.step(rest)
+  batch = envs.unwrapped.parts[0].batch
+  places = batch.thread(drain.THREAD).xpos.numpy()[0]
+  way = (places[10] - places[0]) / np.linalg.norm(places[10] - places[0])
+  body = batch.model.body(f"{drain.THREAD}_10").id
+  for share in (0.3, 0.6, 1.0, 1.0, 1.0):
+    pull(batch, body, share * 1.5 * way)
+    seen, *_ = envs.step(rest)
+    if not seen["attached"][0]:
+      break
+  assert seen["attached"].tolist() == [[0.0], [1.0]]
+  pull(batch, body, 0.0 * way)
+  assert np.linalg.norm(seen["needle"][0]) < 0.03  # in the jaws still
+  loose = rest.copy()
+  loose[0, alone[0].unwrapped.environment.task.components.index("jaw")] = OPEN
+  for _ in range(25):
+    seen, _, terminated, *_ = envs.step(loose)
+    assert not terminated.any()
+  held = np.linalg.norm(seen["needle"], axis=1)
+  assert held[0] > 0.05 > 0.03 > held[1]
+  seen = envs.reset(seed=3)[0]
+  assert seen["attached"].tolist() == [[1.0], [1.0]]
+  envs.close()
+
+
+def pull(batch, body, force):
+  """Pulls at a body in the first world [N]."""
+  if batch.device.is_cpu and hasattr(batch, "datas"):
+    batch.datas[0].xfrc_applied[body, :3] = force
+    return
+  whole = batch.d.xfrc_applied.numpy()
+  whole[0, batch.numbers[body], :3] = force
+  batch.d.xfrc_applied.assign(whole)
+
+
+@pytest.mark.slow
+def test_an_experts_actions_place_and_tie_the_same_stitch_in_a_batch():
+  envs, alone, seen, expected = beside(1, "cpu")
+  act, step = performer.make(alone[0].unwrapped.environment), dm_env.restart(expected[0])
+  over = False
+  while not over:
+    action = act(step).astype(np.float32)
+    seen, _, terminated, _, info = envs.step(action[None])
+    expected, _, over, _, told = alone[0].step(action)
+    assert terminated.tolist() == [over]
+    if not over:
+      for name in ("right_holds", "left_holds", "pierced", "attached", "tied"):
+        assert seen[name][0] == expected[name], name
+    step = dm_env.transition(0.0, expected)
+  final = info["final_info"]
+  assert final["outcome"][0] == told["outcome"] == "success"
+  for name in ("peak_tension", "peak_traction", "final_gap", "tearing", "regrasps", "time"):
+    limit = 1e-4 if name == "final_gap" else 0.05
+    assert final["metrics"][name][0] == pytest.approx(told["metrics"][name], abs=limit), name

@@ -30,10 +30,7 @@ from ...core.base import Physics
 from ...core.performer import Performer, Script
 from ...core.rules import (
   DAMAGED,
-  HIDDEN,
-  LATER,
   MISSED,
-  NOW,
   RUNNING,
   SUCCESS,
   Rules,
@@ -52,7 +49,6 @@ from .. import sheet
 from .needles import (
   FRICTION,
   LOST,
-  MARK,
   MEETS,
   QUARTER,
   RADIUS,
@@ -65,6 +61,7 @@ from .needles import (
   grasped,
   half_angle,
   lowest,
+  mark_hole,
   open_holes,
   piercing,
   right_grasp,
@@ -163,12 +160,6 @@ def observe(s, o):
   return o
 
 
-def mark(s, o, k):
-  """Marks what is left, the next one in yellow."""
-  look = LATER if k > o.holes else HIDDEN
-  return o.marks[k] + vector(0.0, 0.0, MARK), NOW if k == o.holes else look
-
-
 class Drive(Stitching):
   """Drive a needle through two marks."""
 
@@ -178,7 +169,7 @@ class Drive(Stitching):
     observe,
     ("target", "way", "circle", "middle", "pierced", "out", "holds"),
     metrics={"peak_traction": "pulled", "bite_depth": "deepest"},
-    mark=mark,
+    mark=mark_hole,
   )
   targets = 2
 

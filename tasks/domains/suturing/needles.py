@@ -17,6 +17,9 @@ from ...core.base import Physics, Task
 from ...core.performer import Performer, Script
 from ...core.rules import (
   FAR,
+  HIDDEN,
+  LATER,
+  NOW,
   drop,
   length,
   needle_place,
@@ -120,6 +123,12 @@ def open_holes(s, o, count):
   for k in range(count):
     worst = max(worst, o.misses[k])
   return o, worst
+
+
+def mark_hole(s, o, k):
+  """Marks the holes that are left to make, the next one in yellow."""
+  look = LATER if k > o.holes else HIDDEN
+  return o.marks[k] + vector(0.0, 0.0, MARK), NOW if k == o.holes else look
 
 
 def lowest(s):

@@ -20,46 +20,53 @@ closeness of the tip to the first mark; 0.1 + 0.1 * closeness to the second one;
 share of the needle that is through both; 0.3 once that is through, 0.4 once it is off; then that of
 `knot`. Failure: a hole farther from its mark, a needle that nobody holds for half a second while it
 is on its thread, and what fails in `knot`.
-
-It has no vectorised form: its rules look at the thread beside the needle, and take the needle off.
 """
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
-import palpate
+import warp as wp
 from palpate.models import wrist
+from palpate.tissue.types import Array, floats
 
 from ...core.base import Physics
 from ...core.performer import Performer, Script
 from ...core.rules import (
-  DAMAGED,
-  OUTCOMES,
-  SUCCESS,
+  MISSED,
+  RUNNING,
+  Rules,
+  Vector,
   clamp,
   closeness,
+  fasten,
+  hold,
+  length,
   needle_place,
   pierced,
   pinhole,
+  put_away,
+  tip,
   torn_at,
+  tugged,
+  vector,
 )
 from ...core.scenes import Scene
 from ...core.stage import Stage
 from ...registry import exercise
 from . import drain, knot
-from .knot import BEYOND, HOLD, Knot, Tie
+from .drain import BITE
+from .knot import BEYOND, HOLD, Knot, Tie, follow, judge, see_tails
 from .needles import (
   LEFT,
   LOST,
-  MARK,
   OUT,
   QUARTER,
   RADIUS,
   RIGHT,
   WIDE,
+  Hands,
   Stitching,
   approach,
   arc,
@@ -70,6 +77,7 @@ from .needles import (
   jaws,
   left_grasp,
   let_go,
+  mark_hole,
   one,
   open_holes,
   park,
@@ -92,8 +100,8 @@ _DRAG = 2e-3  # of the thread, as in water [N s/m^2]
 # Pull at which the needle comes off [N], and edges of the thread beside it that it is read from.
 # Needles that are made for it do so with 0.3 to 7 N (1 to 26 oz, patent CA 1042301).
 _OFF, _BESIDE = 1.0, 6
-# A needle that is off and let go of for so long [s] is taken away: to there [m].
-_TAKEN, _AWAY = 0.1, np.array([0.1, 0.0, -0.05])
+# A needle that is off and let go of for so long [s] is taken away: as far right and down [m].
+_TAKEN, _RIGHT, _DOWN = 0.1, 0.1, 0.05
 # How the needle begins: its tip before the first mark [rad], off its circle through it, and how far
 # that is drawn [m]; how the thread does, away from both hands.
 _BEFORE, _OVER, _DRAWN = math.radians(10.0), np.array([0.003, 0.0, 0.008]), 0.003
@@ -116,6 +124,100 @@ def standard(**kwargs):
   return Stitch(FIELD, **{"turns": 2, "tolerance": 0.001, "jitter": 0.002, **kwargs})
 
 
+class State(knot.State, Hands):
+  """State of a world."""
+
+  tolerance: float  # how far holes may be from their marks [m]
+  marks: Annotated[Any, Array(wp.vec3, ("targets",))]  # [m]
+  misses: Annotated[Any, floats("targets")]  # how far the holes are from them [m]
+  start0: float  # how far the tip was from the first one at the start [m]
+  holes: int
+  worst: float  # how far a hole is from its mark at most [m]
+  torn: float  # how far a hole has torn at most [m]
+  placed: bool  # whether the needle is through
+  right_needle: float  # whether a hand holds the needle; right_holds tells of the thread too
+  left_needle: float
+  target: Vector
+  circle: Vector
+  needle: Vector
+  pierced: float
+  attached: float  # whether the needle is on its thread
+
+
+# The rules.
+
+
+def begin(s, o):
+  """Lets the hands hold no thread, and the needle be on it."""
+  for hand in range(2):
+    hold(s, hand, -1, o.anchors[hand], False)
+  fasten(s, o, True)
+  return o
+
+
+def look(s, o):
+  """Follows needle and thread through the tube, and who holds what."""
+  o = follow(s, o)
+  count, _pull = pierced(s)
+  for k in range(count):
+    o.torn = max(o.torn, torn_at(s, k))
+  o, worst = open_holes(s, o, min(count, 2))
+  o.worst = worst
+  if o.whole and not o.placed:
+    _, along = pinhole(s, 1)
+    o.placed = along < 0.0
+  if not o.placed:
+    o.whole = True
+    o.tied = 0.0
+  right, left = right_grasp(s), left_grasp(s)
+  if o.attached > 0.0:
+    o.right_holds = o.right_needle
+    o.left_holds = o.left_needle
+    o = grasped(s, o, right, left)
+    o.right_needle = right
+    o.left_needle = left
+    if tugged(s, _BESIDE) > _OFF:
+      fasten(s, o, False)
+      o.attached = 0.0
+  else:
+    o.loose = o.loose + o.control_timestep if right + left == 0.0 else 0.0
+    if o.loose > _TAKEN:
+      put_away(s, vector(_RIGHT, 0.0, -_DOWN))
+  return o
+
+
+def advance(s, o):
+  """Follows the stitch; see the module's head."""
+  o = look(s, o)
+  o, progress, outcome = judge(s, o)
+  dropped = o.attached > 0.0 and o.loose > LOST
+  if outcome == RUNNING and (dropped or o.worst > o.tolerance):
+    outcome = MISSED
+  if outcome != RUNNING or o.tied > 0.0:
+    return o, progress, outcome
+  if o.placed:
+    return o, 0.3 if o.attached > 0.0 else 0.4, outcome
+  if o.holes == 2:
+    _, along = pinhole(s, 1)
+    return o, 0.2 + 0.1 * clamp(1.0 - along / (2.0 * QUARTER * RADIUS), 0.0, 1.0), outcome
+  far = length(arc(s, 1.0) - o.marks[o.holes])
+  start = BITE if o.holes > 0 else o.start0
+  return o, 0.1 * (float(o.holes) + closeness(far, start)), outcome
+
+
+def observe(s, o):
+  """Finds where needle and tails are, and who holds one."""
+  o = see_tails(s, o)
+  o.right_holds = max(float(o.firm[0]), o.attached * o.right_needle)
+  o.left_holds = max(float(o.firm[1]), o.attached * o.left_needle)
+  middle = needle_place(s, vector(0.0, 0.0, 0.0))
+  o.target = o.marks[min(o.holes, 1)] - arc(s, 1.0)
+  o.circle = needle_place(s, vector(0.0, 0.0, 1.0)) - middle
+  o.needle = middle - tip(s)
+  o.pierced = float(o.holes)
+  return o
+
+
 class Stitch(Knot, Stitching):
   """Drive a needle through a slit, draw its thread through, and tie a throw.
 
@@ -124,7 +226,16 @@ class Stitch(Knot, Stitching):
     attached: whether it is on its thread
   """
 
-  rules = None
+  rules = Rules(
+    State,
+    advance,
+    observe,
+    (*Knot.rules.observed, "target", "circle", "needle", "pierced", "attached"),
+    metrics={**Knot.rules.metrics, "tearing": "torn", "regrasps": "regrasps"},
+    begin=begin,
+    shared=("lips", "marks"),
+    mark=mark_hole,
+  )
   targets = 2
 
   def __init__(self, scene: Scene, random=None, *, turns: int, tolerance: float, **kwargs):
@@ -143,7 +254,8 @@ class Stitch(Knot, Stitching):
 
   def build(self, variant: int | None, nodes: np.ndarray) -> mujoco.MjSpec:
     """Returns the tube, and the thread with its needle, away from it until an episode begins."""
-    line = _AWAY - np.arange(len(nodes))[:, None] * np.array([0.0, 0.0, drain.EDGE])
+    down = -_DOWN - drain.EDGE * np.arange(len(nodes))
+    line = np.stack([np.full(len(nodes), _RIGHT), np.zeros(len(nodes)), down], axis=1)
     spec = drain.build(
       self._scene(variant), line, friction=_FRICTION, tough=_TOUGH, wall=_WALL, needle=1 | _MEETS,
       drag=_DRAG,
@@ -169,89 +281,26 @@ class Stitch(Knot, Stitching):
     self.start0 = float(np.linalg.norm(tip - self.marks[0]))
     tail = _TAIL + self.random.uniform(-0.15, 0.15, 3)
     swage = 2.0 * pos - tip
-    thread = palpate.Thread(physics.model.ptr, physics.data.ptr, drain.THREAD)
+    thread = physics.thread
+    assert thread
     thread.lay(np.array([swage, swage + tail]))
+    self.threads = {thread.name: thread.positions}
     left = physics.hands[1]
     place, turn = park(left.trocar())
     place = place + self.random.uniform(-0.005, 0.005, 3)
     left.set_joints(wrist.inverse(left.trocar(), place, turn))
-    self.placed, self.attached = False, True
+    self.placed, self.attached, self.pierced = False, 1.0, 0.0
     self.holes, self.misses, self.worst, self.torn = 0, np.zeros(2), 0.0, 0.0
+    self.right_needle, self.left_needle = 1.0, 0.0
+    self.target, self.circle, self.needle = np.zeros((3, 3))
 
   def still(self, hand: int) -> np.ndarray:
     """Returns what keeps the jaws closed on the needle, or open."""
     return Stitching.still(self, hand)
 
-  def look(self, physics: Physics) -> None:
-    """Follows needle and thread through the tube, and who holds what."""
-    knot.follow(physics, self)
-    count, _ = pierced(physics)
-    self.torn = max([self.torn, *(torn_at(physics, k) for k in range(count))])
-    _, self.worst = open_holes(physics, self, min(count, 2))
-    self.placed = self.placed or (self.whole and pinhole(physics, 1)[1] < 0.0)
-    self.whole = self.whole or not self.placed
-    self.tied = self.tied and self.placed
-    right, left = right_grasp(physics), left_grasp(physics)
-    if not self.attached:
-      self.loose = 0.0 if right + left else self.loose + self.control_timestep
-      if self.loose > _TAKEN:
-        joint = physics.data.ptr.joint("needle")
-        joint.qpos[:3], joint.qvel[:] = _AWAY, 0.0
-      return
-    grasped(physics, self, right, left)
-    assert physics.thread
-    if physics.thread.tension[:_BESIDE].min() > _OFF:
-      which = physics.model.ptr.equality(f"needle_{drain.THREAD}").id
-      physics.data.ptr.eq_active[which] = 0
-      self.attached = False
-      self.event(physics, "note", label="needle off its thread")
-
-  def advance(self, physics: Physics) -> float:
-    """Follows the stitch; see the module's head."""
-    self.look(physics)
-    _, progress, outcome = knot.judge(physics, self)
-    self.outcome = OUTCOMES[outcome]
-    if outcome == DAMAGED:
-      self.event(physics, "note", label=self.label("damage"))
-    progress = 1.0 if outcome == SUCCESS else progress
-    dropped = self.attached and self.loose > LOST
-    if self.outcome is None and (dropped or self.worst > self.tolerance):
-      self.outcome = "missed"
-      self.event(physics, "note", label=self.label("missed"))
-    self.show(physics)
-    if self.outcome is not None or self.tied:
-      return progress
-    if self.placed:
-      return 0.3 if self.attached else 0.4
-    if self.holes == 2:
-      along = pinhole(physics, 1)[1]
-      return 0.2 + 0.1 * clamp(1.0 - along / (2.0 * QUARTER * RADIUS), 0.0, 1.0)
-    far = float(np.linalg.norm(arc(physics, 1.0) - self.marks[self.holes]))
-    return 0.1 * (self.holes + closeness(far, drain.BITE if self.holes else self.start0))
-
-  def observe(self, physics: Physics) -> Mapping[str, np.ndarray]:
-    """Returns where needle and tails are."""
-    middle, end = (needle_place(physics, at) for at in (np.zeros(3), np.array([0.0, 0.0, 1.0])))
-    seen: Any = knot.see_tails(physics, self)
-    holds = {"right_holds": self.right_holds, "left_holds": self.left_holds}
-    return {
-      **{name: np.array(getattr(seen, name), float, ndmin=1) for name in Knot.rules.observed},
-      **{
-        name: np.maximum(float(firm), self.attached * np.array([needle]))
-        for (name, needle), firm in zip(holds.items(), self.firm, strict=True)
-      },
-      "target": self.marks[min(self.holes, 1)] - arc(physics, 1.0),
-      "circle": end - middle,
-      "needle": middle - physics.tip_pos(),
-      "pierced": np.array([float(self.holes)]),
-      "attached": np.array([float(self.attached)]),
-    }
-
   def show(self, physics: Physics) -> None:
     """Marks the holes that are left, the next one in yellow."""
-    for k, place in enumerate(self.marks):
-      place = place + np.array([0.0, 0.0, MARK])
-      physics.mark(k, place, k >= self.holes, k == self.holes, self.mark_size(k))
+    super(Knot, self).show(physics)
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns how far a hole is torn and how often the needle was grasped anew as well."""
