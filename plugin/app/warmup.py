@@ -30,7 +30,7 @@ def main(args: argparse.Namespace) -> int:
   jobs = [
     (device, module)
     for device in ([args.device] if args.device else known)
-    for module in kernels.MODULES["cpu" if device == "cpu" else "cuda"]
+    for module in kernels.longest_first("cpu" if device == "cpu" else "cuda")
   ]
 
   def load(job: tuple[str, str]) -> float:

@@ -49,7 +49,7 @@ class Telling:
   told: ToldNeedles
 
 
-_tell = kernel("tell_needles", "forces/needles.h", Telling, CONSTANTS)
+_tell = kernel("tell_needles", "forces/needles.h", Telling, CONSTANTS, tag=".worlds")
 
 
 class Shown:

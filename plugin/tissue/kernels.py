@@ -171,6 +171,18 @@ def _module(header: str, kind: str, constants: tuple, tag: str) -> str:
   return name
 
 
+def longest_first(kind: str) -> list[str]:
+  """Returns the modules for a kind of device, those with the longest text first.
+
+  These take longest to compile: where some are compiled at once, none is then left over at the end.
+  """
+
+  def length(name: str) -> int:
+    return len(getattr(wp.get_module_options(name)["extra_build_options"], f"extra_{kind}_preamble"))
+
+  return sorted(MODULES[kind], key=length, reverse=True)
+
+
 def _constexpr(constants: Mapping[str, int | float]) -> str:
   """Returns C++ that declares numbers under their Python names."""
   lines = [
