@@ -59,7 +59,7 @@ _SNUG = 0.0018  # of a strand in a throw that is drawn tight, at most, for each 
 _LET_GO = 0.3  # strands lie so long before the knot is tested [s]
 _HOLDS, _LAST, _RISES = PULL, 2.0, 2.0  # pull that it is to hold, the last [N], and the rise [N/s]
 _TRIES, _LIFT = 6, np.array([0.0, 0.0, 0.002])  # of the expert at a throw, and between them [m]
-_LAID = 0.004  # least depth below the ring of a throw that was just laid [m]
+_THERE = 0.002  # from the mark, where throws are laid [m]
 _MARK = 0.018  # height of the mark over the drain [m]
 
 
@@ -282,25 +282,29 @@ class Extracorporeal(drain.Sewn):
   def expert(self, p: Performer) -> Script:
     """Takes the ring down the post, presses each throw home, and goes back up."""
     while self.outcome is None:
-      if p.tip[2] - self.throw[2] > _LAID:  # strands that were just laid draw straight: all wait
-        yield from Performer.wait(p, 0.2)
       laid = self.laid
-      goal = np.array([0.0, 0.0, drain.HIGH + 0.001])
-      yield from p.move(goal, speed=0.02)
-      # On a double throw others lock loose: they are let go and drawn tight before they stay.
-      loose = 2 if self.turns[0] > 1 and laid > 1 else 0
-      for k in range(_TRIES):
-        waits = 0.5 * STAYS if k < loose else 0.8
-        yield from _until(p, waits, lambda laid=laid: self.seated == laid)
-        if self.seated == laid:
-          break
-        # A throw that is pressed on locks. Let go, it slides on and the hands draw the slack up.
-        yield from p.line(goal + _LIFT, speed=0.02)
-        yield from p.line(goal, speed=0.02)
+      if self.seated < laid:  # not of who goes on where another has pressed it home
+        yield from self._press(p, laid)
       if self.seated == self.throws:
         yield from Performer.wait(p, math.inf)
       yield from p.move(self.mark, speed=0.03)
       yield from _until(p, 0.5, lambda laid=laid: self.laid > laid)
+
+  def _press(self, p: Performer, laid: int) -> Script:
+    """Takes the ring down, and presses the throw that was laid last until it is home."""
+    if math.dist(p.tip, self.mark) < _THERE:  # strands that were just laid draw straight: all wait
+      yield from Performer.wait(p, 0.2)
+    goal = np.array([0.0, 0.0, drain.HIGH + 0.001])
+    yield from p.move(goal, speed=0.02)
+    # On a double throw others lock loose: they are let go and drawn tight before they stay.
+    loose = 2 if self.turns[0] > 1 and laid > 1 else 0
+    for k in range(_TRIES):
+      yield from _until(p, 0.5 * STAYS if k < loose else 0.8, lambda: self.seated == laid)
+      if self.seated == laid:
+        break
+      # A throw that is pressed on locks. Let go, it slides on and the hands draw the slack up.
+      yield from p.line(goal + _LIFT, speed=0.02)
+      yield from p.line(goal, speed=0.02)
 
 
 def _until(p: Performer, most: float, done: Callable[[], bool]) -> Script:

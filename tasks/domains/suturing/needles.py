@@ -59,6 +59,11 @@ _OPENING = 0.056  # of each jaw, just off the wire [rad]
 _BITE = 0.0036  # from the tip of the jaws to the wire between them [m]
 _SPEED, _TURN, _CLOSE = 0.03, 1.2, 3.0  # of an expert's hand [m/s, rad/s] and jaws [1/s]
 _BACK, _UP, _HIGH = 0.01, 0.008, 0.006  # of hands off a needle, and of one over its mark [m]
+# Of a teacher: width of the cone over a goal, at its tip [m] and by height [-], how far a frame may
+# be turned there [rad], height of the cone and that jaws close from, how far off a hand has let go,
+# and how far back a needle is put right before it goes in [m].
+NARROW, TURNED = 0.0015, 0.2
+_CONE, _TALL, _CLOSES, _CLEAR, _FREE = 0.2, 0.032, 0.002, 0.02, 0.002
 
 Pose = tuple[np.ndarray, np.ndarray]  # place [m] (3,), and frame in columns (3, 3)
 
@@ -309,16 +314,21 @@ def move_tip(p: Performer, goal: np.ndarray, turn: np.ndarray) -> Script:
     yield p.step()
 
 
-def carry(p: Performer, path: Callable[[float], Pose], angle: float | None = None) -> Script:
+def carry(
+  p: Performer, path: Callable[[float], Pose], angle: float | None = None, pushes: bool = False
+) -> Script:
   """Moves the needle with the hand that holds it.
 
   Args:
     p: of the hand
     path: returns the needle's pose at a share of the way, or its end alone
     angle: that it turns by on the way [rad]; None to go to the end in a line
+    pushes: whether a teacher pushes on as hard as who had the hand before
   """
-  pos, mat = needle(p.physics)
-  held, frame = mat.T @ (p.hand.tip_pos() - pos), mat.T @ matrix(p.hand.tip_quat())
+  (pos, mat), tip, turned = needle(p.physics), p.hand.tip_pos(), matrix(p.hand.tip_quat())
+  if pushes and p.hasty:
+    tip, turned = p.tip, p.turn
+  held, frame = mat.T @ (tip - pos), mat.T @ turned
   end, turn = path(1.0)
   for t in p.shares(_steps(p, end - pos, apart(mat, turn) if angle is None else abs(angle))):
     if angle is None:
@@ -334,10 +344,19 @@ def carry(p: Performer, path: Callable[[float], Pose], angle: float | None = Non
 
 def approach(p: Performer, ends: np.ndarray, before: float) -> Script:
   """Puts the needle over the first of two marks (2, 3), its tip by an angle before it [rad]."""
-  pos, mat = piercing(ends, -half_angle(ends) - before)
-  yield from carry(p, lambda t: (pos + np.array([0.0, 0.0, _HIGH]), mat))
+  up, goal = np.array([0.0, 0.0, 1.0]), piercing(ends, -half_angle(ends) - before)
+
+  def begun() -> bool:
+    return p.hasty and _turns_in(p, ends, before)
+
+  if begun():
+    return
+  high = goal[0] + min(height(p, needle(p.physics), goal, up), _HIGH) * up
+  yield from come(
+    carry(p, lambda t: (high, goal[1])), lambda: over(p, needle(p.physics), goal, up)
+  )
   yield from arrive(p)
-  yield from carry(p, lambda t: (pos, mat))
+  yield from come(carry(p, lambda t: goal), begun)
   yield from arrive(p)
 
 
@@ -352,18 +371,29 @@ def turn_on(p: Performer, ends: np.ndarray, end: float, most: float = LOOK) -> S
   def way(t: float) -> Pose:
     return piercing(ends, start + t * (stop - start))
 
-  yield from carry(p, way, stop - start)
+  yield from carry(p, way, stop - start, pushes=True)
   yield from arrive(p)
 
 
 def take(p: Performer, angle: float, tilt: float) -> Script:
   """Takes the needle from behind, at an angle along its arc, with tilted jaws."""
-  p.extra[:] = WIDE
   pos, mat = needle(p.physics)
-  goal, turn = grasp(p.trocar, pos, mat * (1, 1, -1), angle, p.turn, tilt)
-  yield from move_tip(p, goal + _away(turn), turn)
+  goal = grasp(p.trocar, pos, mat * (1, 1, -1), angle, p.turn, tilt)
+  yield from close_on(p, goal, _away(goal[1]))
+
+
+def close_on(p: Performer, goal: Pose, off: np.ndarray) -> Script:
+  """Brings open jaws to a pose from where they are off it by a way [m]  (3,), and closes them."""
+  place, turn = goal
+  up = off / np.linalg.norm(off)
+
+  def there() -> bool:
+    return over(p, (p.tip, p.turn), goal, up)
+
+  p.extra[:] = p.share() if there() and (p.tip - place) @ up < _CLOSES else WIDE
+  yield from come(move_tip(p, place + off, turn), there)
   yield from arrive(p)
-  yield from move_tip(p, goal, turn)
+  yield from move_tip(p, place, turn)
   yield from arrive(p)
   yield from jaws(p, -1.0)
   yield from p.wait(0.2)
@@ -371,9 +401,20 @@ def take(p: Performer, angle: float, tilt: float) -> Script:
 
 def let_go(p: Performer) -> Script:
   """Opens the jaws and takes the hand back and aside."""
+  yield from leave(p, _away(p.turn), (park(p.trocar)[0], p.turn))
+
+
+def leave(p: Performer, off: np.ndarray, end: Pose) -> Script:
+  """Opens the jaws, takes the hand off by a way [m]  (3,), and brings it to a pose."""
+  if p.hasty:  # from where another has come to
+    p.extra[:] = p.share()
   yield from jaws(p, WIDE)
-  yield from move_tip(p, p.tip + _away(p.turn), p.turn)
-  yield from move_tip(p, park(p.trocar)[0], p.turn)
+
+  def gone() -> bool:
+    return p.hasty and not lingers(p)
+
+  yield from come(move_tip(p, p.tip + off, p.turn), gone)
+  yield from come(move_tip(p, *end), gone)
 
 
 def park(port: Any) -> Pose:
@@ -425,3 +466,46 @@ def tip_angle(physics: Any, ends: np.ndarray) -> float:
   (way, up), tip = facing(ends), arc(physics, 1.0) - needle(physics)[0]
   angle = math.atan2(float(tip @ way), -float(tip @ up))
   return angle if angle > -QUARTER else angle + 4.0 * QUARTER
+
+
+# What a teacher leaves out: two who come to one place by different ways go on alike from there.
+
+
+def come(script: Script, there: Callable[[], bool]) -> Script:
+  """Does a script until something is so."""
+  while not there() and (action := next(script, None)) is not None:
+    yield action
+
+
+def over(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> bool:
+  """Returns whether a teacher's pose is in the cone over a goal that it comes down in."""
+  off = pose[0] - goal[0]
+  high = float(off @ up)
+  aside = float(np.linalg.norm(off - high * up))
+  far = aside > NARROW + _CONE * max(high, 0.0) or apart(pose[1], goal[1]) > TURNED
+  return p.hasty and -2 * NARROW < high < _TALL and not far
+
+
+def height(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> float:
+  """Returns how high over a goal a pose is put right [m].
+
+  A teacher goes back no further than it must. Who learns from one that goes all of the way back, or
+  none of it, goes to and fro before the goal.
+  """
+  off = pose[0] - goal[0]
+  aside = float(np.linalg.norm(off - (off @ up) * up))
+  turned = apart(pose[1], goal[1]) / TURNED
+  return max(aside - NARROW, 0.0) + _FREE * max(turned, 1.0) if p.hasty else math.inf
+
+
+def lingers(p: Performer) -> bool:
+  """Returns whether a teacher's hand that let go is still at the needle."""
+  return p.hasty and away(p.physics, p.hand.tip_pos()) < _CLEAR
+
+
+def _turns_in(p: Performer, ends: np.ndarray, before: float) -> bool:
+  """Returns whether a needle may turn through two marks (2, 3) from where it is."""
+  (pos, mat), angle = needle(p.physics), tip_angle(p.physics, ends)
+  place, turned = piercing(ends, angle)
+  there = float(np.linalg.norm(pos - place)) < NARROW and apart(mat, turned) < TURNED
+  return there and -before - TURNED < angle + half_angle(ends) < 2 * half_angle(ends)

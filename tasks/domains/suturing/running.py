@@ -88,6 +88,7 @@ from .needles import (
   half_angle,
   left_grasp,
   let_go,
+  lingers,
   lowest,
   one,
   open_holes,
@@ -405,7 +406,7 @@ class Running(Stitching):
       out = self.holes == 2 * self.done + 2
       if self.done == STITCHES:
         yield from one(p, p.other, self._pull(p.other, lambda: self.outcome is not None))
-      elif self.right_holds and out and self.left_holds:
+      elif out and self.left_holds and (self.right_holds or lingers(p)):
         yield from one(p, p, let_go(p))
       elif self.left_holds and out:
         yield from one(p, p.other, self._draw(p.other))

@@ -21,7 +21,6 @@ damage limit, or the time limit.
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import mujoco
@@ -56,24 +55,28 @@ from ...registry import exercise
 from .needles import (
   LOST,
   MEETS,
+  NARROW,
   PIECES,
   QUARTER,
   RADIUS,
-  WIDE,
+  TURNED,
   Hands,
   Needlework,
   Pose,
   apart,
   arc,
-  away,
   carry,
+  close_on,
+  come,
   grasp,
   grasped,
-  jaws,
+  height,
+  leave,
   left_grasp,
-  move_tip,
+  lingers,
   needle,
   one,
+  over,
   right_grasp,
 )
 
@@ -93,10 +96,6 @@ _APART = 0.034  # of rings: needle and wrist have room between them [m]
 # turn that an end enters with, that of the handing over, and what is behind the ring in the end.
 _ENTERS, _HANDS, _TAKES = math.radians(20.0), math.radians(20.0), math.radians(65.0)
 _BACK, _RISE = 0.014, 0.016  # out of a ring, and off the needle [m]
-# Of a teacher: width of the cone over a goal, at its tip [m] and by height [-], how far a frame may
-# be turned there [rad], height that jaws close from, and how far off a hand has let go [m].
-_NARROW, _CONE, _TURNED, _CLOSES, _CLEAR = 0.0015, 0.2, 0.2, 0.002, 0.02
-_FREE = 0.002  # how high a needle is before a ring that may be put right there [m]
 
 
 @exercise("needle/transfer_easy", 25, "easy", "bimanual")
@@ -337,7 +336,7 @@ class Transfer(Needlework):
       mine, others = self.right_holds > 0, self.left_holds > 0
       giver, taker = (others, mine) if back(self) else (mine, others)
       off = self.through - (0.5 - _HANDS / math.pi)
-      if taker and self.through and (giver or _lingers(gives)):
+      if taker and self.through and (giver or lingers(gives)):
         yield from one(p, gives, _let_go(self, gives))
       elif giver and (off < -0.03 or (p.hasty and abs(off) > 0.02)):
         yield from one(p, gives, self._drive(gives))
@@ -361,11 +360,11 @@ class Transfer(Needlework):
           out = pos - sign * left * self.ways[ring - 1]
           yield from carry(p, lambda t: (out, turned))
       way = sign * self.ways[ring]
-      clear = place - min(_height(p, needle(p.physics), (place, mat), -way), _BACK) * way
-      yield from _come(
-        carry(p, lambda t: (clear, mat)), lambda: _over(p, needle(p.physics), (place, mat), -way)
+      clear = place - min(height(p, needle(p.physics), (place, mat), -way), _BACK) * way
+      yield from come(
+        carry(p, lambda t: (clear, mat)), lambda: over(p, needle(p.physics), (place, mat), -way)
       )
-      yield from _come(carry(p, lambda t: (place, mat)), lambda: _begun(p, self))
+      yield from come(carry(p, lambda t: (place, mat)), lambda: _begun(p, self))
     start, end = turn_of(self, p.physics), -QUARTER - sign * _HANDS
     yield from carry(p, lambda t: posed(self, ring, start + t * (end - start)), end - start)
 
@@ -375,14 +374,7 @@ class Transfer(Needlework):
     pos, mat = needle(p.physics)
     goal, turn = grasp(p.trocar, pos, mat, sign * _TAKES)
     up = mat[:, 2]
-    closes = _over(p, (p.tip, p.turn), (goal, turn), up) and (p.tip - goal) @ up < _CLOSES
-    p.extra[:] = p.share() if closes else WIDE
-    yield from _come(
-      move_tip(p, goal + _RISE * up, turn), lambda: _over(p, (p.tip, p.turn), (goal, turn), up)
-    )
-    yield from move_tip(p, goal, turn)
-    yield from jaws(p, -1.0)
-    yield from p.wait(0.2)
+    yield from close_on(p, (goal, turn), _RISE * up)
 
   def _pull(self, p: Performer) -> Script:
     """Turns the needle on until all of it is through, and out of the ring's way."""
@@ -425,34 +417,8 @@ def park(task: Transfer, port: Any, middle: np.ndarray) -> Pose:
 
 def _let_go(task: Transfer, p: Performer) -> Script:
   """Opens the jaws and takes the hand aside."""
-  if p.hasty:  # from where another has come to
-    p.extra[:] = p.share()
-  yield from jaws(p, WIDE)
-
-  def gone() -> bool:
-    return p.hasty and not _lingers(p)
-
-  yield from _come(move_tip(p, p.tip + _RISE * p.turn[:, 2], p.turn), gone)
-  pos, turn = park(task, p.trocar, task.middles.mean(axis=0))
-  yield from _come(move_tip(p, pos, turn), gone)
-
-
-# What a teacher leaves out: two who come to one place by different ways go on alike from there.
-
-
-def _come(script: Script, there: Callable[[], bool]) -> Script:
-  """Does a script until something is so."""
-  while not there() and (action := next(script, None)) is not None:
-    yield action
-
-
-def _over(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> bool:
-  """Returns whether a teacher's pose is in the cone over a goal that it comes down in."""
-  off = pose[0] - goal[0]
-  high = float(off @ up)
-  aside = float(np.linalg.norm(off - high * up))
-  far = aside > _NARROW + _CONE * max(high, 0.0) or apart(pose[1], goal[1]) > _TURNED
-  return p.hasty and -2 * _NARROW < high < 2 * _RISE and not far
+  end = park(task, p.trocar, task.middles.mean(axis=0))
+  yield from leave(p, _RISE * p.turn[:, 2], end)
 
 
 def _begun(p: Performer, task: Transfer) -> bool:
@@ -460,22 +426,5 @@ def _begun(p: Performer, task: Transfer) -> bool:
   (pos, mat), turn, sign = needle(p.physics), turn_of(task, p.physics), -1.0 if back(task) else 1.0
   place, turned = posed(task, now(task), turn)
   way = sign * (turn + QUARTER) + QUARTER + _ENTERS
-  there = float(np.linalg.norm(pos - place)) < _NARROW and apart(mat, turned) < _TURNED
-  return p.hasty and there and -_TURNED < way < 2 * _ENTERS
-
-
-def _height(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> float:
-  """Returns how high over a goal a pose is put right [m].
-
-  A teacher goes back no further than it must. Who learns from one that goes all of the way back, or
-  none of it, goes to and fro before the goal.
-  """
-  off = pose[0] - goal[0]
-  aside = float(np.linalg.norm(off - (off @ up) * up))
-  turned = apart(pose[1], goal[1]) / _TURNED
-  return max(aside - _NARROW, 0.0) + _FREE * max(turned, 1.0) if p.hasty else math.inf
-
-
-def _lingers(p: Performer) -> bool:
-  """Returns whether a teacher's hand that let go is still at the needle."""
-  return p.hasty and away(p.physics, p.hand.tip_pos()) < _CLEAR
+  there = float(np.linalg.norm(pos - place)) < NARROW and apart(mat, turned) < TURNED
+  return p.hasty and there and -TURNED < way < 2 * _ENTERS

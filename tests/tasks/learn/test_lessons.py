@@ -56,7 +56,10 @@ def test_teachers_close_jaws_that_somebody_has_begun_to_close():
   assert lessons.Teacher(env)(env.step(np.zeros(5) - 0.35))[4] == 1.0  # nothing is held: again
 
 
-@pytest.mark.parametrize(("domain", "level"), [("grasp", "easy"), ("needle", "transfer_easy")])
+@pytest.mark.parametrize(
+  ("domain", "level"),
+  [("grasp", "easy"), ("needle", "transfer_easy"), ("suture", "running_easy")],
+)
 def test_teachers_that_take_turns_are_as_quick_as_one(domain, level):
   env = tasks.load(domain, level, task_kwargs={"surroundings": "none"})
 
