@@ -14,6 +14,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 from palpate.camera import Camera
+from palpate.engine import graphs
 from palpate.engine import plugin as engine
 from palpate.forces.cohesive_bonds import Bonds
 from palpate.organ import instances
@@ -286,7 +287,7 @@ class Worlds(Batch):
     return out
 
   def record(self):
-    """Records the graphs, on a device that has them."""
+    """Records the graphs."""
     with wp.ScopedDevice(self.device):  # where mujoco_warp makes its arrays
       self._record()
 
@@ -297,16 +298,14 @@ class Worlds(Batch):
     if not self.device.is_cuda:
       for each in (*self._organs.values(), *self.rods.all.values()):
         each.load()
-      self._graphs = {name: (None, each) for name, each in work.items()}
-      return
-    if not self._graphs:  # what this does to the worlds, their first reset undoes
+    elif not self._graphs:  # what this does to the worlds, their first reset undoes
       compile_ahead(self.device, work.values())
       for each in work.values():
         each()
     for name, each in work.items():
-      with wp.ScopedCapture(self.device) as capture:
-        each()
-      self._graphs[name] = (capture.graph, each)
+      # On the CPU Warp takes a generic kernel's overloads, which resets have, for one another.
+      recorded = self.device.is_cuda or name == "step"
+      self._graphs[name] = (graphs.record(self.device, each) if recorded else None, each)
 
   def _run(self, name: str):
     graph, work = self._graphs[name]

@@ -178,7 +178,8 @@ def longest_first(kind: str) -> list[str]:
   """
 
   def length(name: str) -> int:
-    return len(getattr(wp.get_module_options(name)["extra_build_options"], f"extra_{kind}_preamble"))
+    options = wp.get_module_options(name)["extra_build_options"]
+    return len(getattr(options, f"extra_{kind}_preamble"))
 
   return sorted(MODULES[kind], key=length, reverse=True)
 
