@@ -53,7 +53,7 @@ def marking(own: Rules) -> Any:
   """Returns the kernel of a domain's marks."""
   state, module = compiled(own)[0], wp.get_module(own.state.__module__)
   assert own.mark
-  rule = translate(own.mark, module, dict(WORDS))
+  rule = translate(own.mark, module, dict(WORDS), set())
 
   def mark(s: Common, states: wp.array(dtype=state), m: Marks):
     r, k = wp.tid()
