@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.engine import coupling, rods
+from palpate.engine import coupling
 from palpate.engine.model.declare import Declaration
 from palpate.engine.workspace import Workspace
 from palpate.organ import instances
-from palpate.thread import no_hold
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.reading import count_of
 
 from .cutting.fracture import Parting
 from .needles import Needles
+from .thread import Thread
 
 if TYPE_CHECKING:
   from palpate.camera import Camera
@@ -521,75 +521,6 @@ class Tissue(Parting):
     Raises:
       ValueError: a key may not change, or a value is not allowed.
     """
-
-
-class Thread(abc.ABC):
-  """One thread in all worlds of a batch; arrays as those of `Batch`, in world coordinates.
-
-  Attributes:
-    name: name of the flexcomp
-    nworld: number of worlds
-    holds: by what bodies can hold it, numbers of equalities by name
-    space: its workspace in one mjData
-  """
-
-  name: str
-  nworld: int
-  holds: Mapping[str, int]
-  space: rods.Workspace
-
-  @property
-  @abc.abstractmethod
-  def xpos(self) -> wp.array:
-    """Positions of the nodes [m], (nworld, nnode, 3)."""
-
-  @property
-  @abc.abstractmethod
-  def tension(self) -> wp.array:
-    """Tension of each edge [N], (nworld, nnode - 1); negative where it is compressed."""
-
-  @property
-  @abc.abstractmethod
-  def broken(self) -> wp.array:
-    """1 where an edge has broken, of float64 (nworld, nnode); the last one is of no edge."""
-
-  @abc.abstractmethod
-  def lay(self, places: np.ndarray, mask=None):
-    """Puts the nodes of worlds at places, at rest; what they are twisted and broken by stays.
-
-    Args:
-      places: [m]  (nworld, nnode, 3)
-      mask: worlds, (nworld,) of bool; None for all
-    """
-
-  def hold(self, by: str, node, anchor, firm):
-    """Lets a body hold a node in each world, or none, see `palpate.Thread.hold`.
-
-    Resets and states let go of them.
-
-    Args:
-      by: name of the equality
-      node: that is held from now on, -1 for none  (nworld,)
-      anchor: where in the body [m]  (nworld, 3)
-      firm: whether the body bears on the node  (nworld,) of bool
-
-    Raises:
-      ValueError: the scene has no such equality, or an array another shape.
-    """
-    if by not in self.holds:
-      raise no_hold(self.name, by, self.holds)
-    nworld = self.nworld
-    given = {"node": (node, (nworld,)), "anchor": (anchor, (nworld, 3)), "firm": (firm, (nworld,))}
-    for name, (value, shape) in given.items():
-      if tuple(np.shape(value)) != shape:
-        raise ValueError(
-          f"thread {self.name!r}: {name} has shape {tuple(np.shape(value))}, expected {shape}"
-        )
-    self._hold(by, node, anchor, firm)
-
-  @abc.abstractmethod
-  def _hold(self, by: str, node, anchor, firm):
-    """Lets a body hold a node."""
 
 
 def on_device(values, dtype, device) -> wp.array:

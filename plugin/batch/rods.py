@@ -19,7 +19,7 @@ from palpate.thread import HELD, LOOSE, holds_of
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import DIMS, Array, also, doubles, fill, floats, ints
 
-from . import base, kernels
+from . import kernels, thread
 from .base import on_device
 from .contact.contact_rows import Early, take_early
 from .mjw.arrays import arrays_of, theirs
@@ -80,7 +80,7 @@ def bytes_of(space: rods.Workspace) -> float:
   return float(sum(8 * each.size for each in rods.scratch(len(space.organ.rest), 0).values()))
 
 
-class Thread(base.Thread):
+class Thread(thread.Thread):
   """A thread of `Worlds`.
 
   Attributes:
@@ -191,7 +191,7 @@ class Thread(base.Thread):
     return self._broken
 
   def lay(self, places: np.ndarray, mask=None):
-    """Puts the nodes of worlds at places, at rest, see `base.Thread`."""
+    """Puts the nodes of worlds at places, at rest, see `thread.Thread`."""
     f, organ, batch = self.fields, self.declared, self._batch
     local = (np.asarray(places, float) - organ.origin) @ organ.frame
     laid: Any = kernels.Laid()

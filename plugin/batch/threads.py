@@ -26,7 +26,7 @@ from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.reading import count_of
 
-from . import base
+from . import thread
 from .base import Batch, Tissue, spread
 from .bonds import OfThreads
 from .cutting.fracture import Cutters
@@ -304,7 +304,7 @@ class _Tissue(Tissue):
     self.batch.each(work, worlds)
 
 
-class _Thread(base.Thread):
+class _Thread(thread.Thread):
   """A thread of `Threads`."""
 
   def __init__(self, batch: Threads, name: str):

@@ -90,7 +90,7 @@ class Rod:
   inverse: doubles("nentry")  # of the matrix without constraints, there
   rank: ints("nplace")  # of a node in the matrix
   near: ints("nplace + 1", "nword_node")  # a bit for each two nodes: neighbours in the matrix
-  ranked: doubles("nunknown", 4)  # scratch
+  ranked: doubles("nunknown", 5)  # scratch
   first: ints("nunknown")  # first column of each row
   start_of_row: ints("nunknown")  # where it is
   last: ints("nunknown")  # scratch, see `Envelope`

@@ -525,3 +525,29 @@ def test_sensors_are_summed_up_over_a_call(both):
     np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
   peak, _, last = found[0]
   assert (peak[:, 1] >= np.linalg.norm(last[:, 3:], axis=1) * 0.999).all() and peak.min() > 0
+
+
+def test_an_equality_is_switched_in_each_world(make):
+  scene = spec(probed())
+  weight = scene.worldbody.add_body(name="weight", pos=(0.1, 0.0, 0.1))
+  weight.add_freejoint()
+  weight.add_geom(size=(0.005, 0, 0), contype=0, conaffinity=0)
+  hook = scene.add_equality(
+    name="hook", type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="weight"
+  )
+  hook.data[:3] = 0.0
+  scene.option.gravity = (0.0, 0.0, -10.0)
+  batch = palpate.batch.make(scene, 2, device=make.device)
+  height = int(batch.model.joint(batch.model.body("weight").jntadr[0]).qposadr[0]) + 2
+  batch.switch("hook", [True, False])
+  batch.step(20)
+  held, fallen = batch.qpos.numpy()[:, height]
+  assert held == pytest.approx(0.1, abs=3e-4) and fallen < 0.1 - 1e-3
+  batch.reset()
+  batch.step(20)
+  np.testing.assert_allclose(batch.qpos.numpy()[:, height], 0.1, atol=3e-4)
+  for wrong, message in (((True,), "active has shape"), ((1.0, 0.0), "active has shape")):
+    with pytest.raises(ValueError, match=message):
+      batch.switch("hook", wrong)
+  with pytest.raises(ValueError, match="no equality 'rope'"):
+    batch.switch("rope", [True, False])

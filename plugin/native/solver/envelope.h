@@ -57,7 +57,7 @@ PALPATE Corner corner(int number) {
 }
 
 // L D L^T = A in place of A: the unit lower triangle L, and on its diagonal 1 / D. Every ROWS rows have the same
-// first column and are taken together. `u` is scratch, ROWS n long. Returns whether A is positive definite, and
+// first column and are taken together. `u` is scratch, (ROWS + 1) n long. Returns whether A is positive definite, and
 // stops where it is not.
 template <int ROWS>
 PALPATE bool factorize(const Envelope& A, double* u);
@@ -71,6 +71,8 @@ CALLED void solve_factorized(const Envelope& L, double* b);
 PALPATE void invert_there(const Envelope& L, const Envelope& Z, int* below, double* u);
 
 #if ON_CUDA
+
+constexpr int AT_ONCE = 4;  // entries of a lane that are on their way at once
 
 // Notes of every ROWS columns, node by node, which is the last node that has them.
 template <int ROWS>
@@ -90,10 +92,11 @@ PALPATE void note_last(const Envelope& A) {
 // Node by node from the first one on, and what is left of those after it by all lanes.
 template <int ROWS>
 PALPATE bool factorize(const Envelope& A, double* u) {
+  double *whole = u, *left = u + A.n;  // of a row its diagonal as it was, and D times what it has in the pivot's columns
   note_last<ROWS>(A);
-  each_lane(0, A.n, [&](int i) { u[i] = A.row(i)[i]; });
+  each_lane(0, A.n, [&](int i) { whole[i] = A.row(i)[i]; });
   for (int p = 0; p < A.n / ROWS; ++p) {
-    const int i = ROWS * p, after = p + 1, behind = A.last[p] + 1;
+    const int i = ROWS * p;
     double l[ROWS][ROWS], d[ROWS], rest[ROWS];  // the pivot's factors, by all lanes alike
     for (int a = 0; a < ROWS; ++a) {
       const double* row = A.row(i + a) + i;
@@ -108,37 +111,38 @@ PALPATE bool factorize(const Envelope& A, double* u) {
         d[a] -= own * l[a][b];
         l[a][b] = own;
       }
-      if (!(d[a] > 1e-12 * u[i + a])) return false;
+      if (!(d[a] > 1e-12 * whole[i + a])) return false;
       rest[a] = 1.0 / d[a];
     }
-    each_lane(after, behind, [&](int k) {
-      if (A.first[ROWS * k] > i) return;
-      for (int a = 0; a < ROWS; ++a) {
-        double own[ROWS], *row = A.row(ROWS * k + a) + i;
-        for (int b = 0; b < ROWS; ++b) {
-          own[b] = row[b];
-          for (int c = 0; c < b; ++c) own[b] -= own[c] * l[b][c];
-          row[b] = own[b] * rest[b];
-        }
+    const int next = i + ROWS, count = ROWS * (A.last[p] - p);  // rows, of which not all have these columns
+    each_lane(0, count, [&](int k) {
+      const bool has = A.first[next + k] <= i;
+      double own[ROWS], *row = A.row(next + k) + i;
+      for (int b = 0; b < ROWS; ++b) {
+        own[b] = has ? row[b] : 0.0;
+        for (int c = 0; c < b; ++c) own[b] -= own[c] * l[b][c];
+        if (has) row[b] = own[b] * rest[b];
+        left[count * b + k] = own[b];
       }
     });
-    const int left = behind - after;
-    each_lane(0, left * (left + 1) / 2, [&](int pair) {
-      const Corner at = corner(pair);
-      const int k = after + at.row, m = after + at.column;
-      if (A.first[ROWS * k] > i || A.first[ROWS * m] > i) return;
-      double other[ROWS][ROWS];
-      for (int b = 0; b < ROWS; ++b)
-        for (int c = 0; c < ROWS; ++c) other[b][c] = d[c] * A.row(ROWS * m + b)[i + c];
-      for (int a = 0; a < ROWS; ++a) {
-        double* row = A.row(ROWS * k + a);
-        for (int b = 0; b < (k == m ? a + 1 : ROWS); ++b) {
-          double sum = 0.0;
-          for (int c = 0; c < ROWS; ++c) sum += row[i + c] * other[b][c];
-          row[ROWS * m + b] -= sum;
-        }
+    for (int from = own_lane(); from < count * (count + 1) / 2; from += AT_ONCE * TOGETHER) {
+      double *to[AT_ONCE], now[AT_ONCE];  // of several entries, which are read before any is written
+#pragma unroll
+      for (int q = 0; q < AT_ONCE; ++q) {
+        const int entry = from + q * TOGETHER;
+        const Corner at = corner(entry);
+        to[q] = nullptr;
+        if (entry >= count * (count + 1) / 2 || A.first[next + at.row] > i) continue;
+        double *row = A.row(next + at.row), sum = 0.0;
+        for (int c = 0; c < ROWS; ++c) sum += row[i + c] * left[count * c + at.column];
+        to[q] = row + next + at.column;
+        now[q] = *to[q] - sum;
       }
-    });
+#pragma unroll
+      for (int q = 0; q < AT_ONCE; ++q)
+        if (to[q]) *to[q] = now[q];
+    }
+    meet_lanes();
     if (own_lane() < ROWS) {
       double* row = A.row(i + own_lane()) + i;
       for (int a = 0; a < ROWS; ++a) {

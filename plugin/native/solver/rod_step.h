@@ -44,14 +44,15 @@ struct RodRow {
 
   // J a - aref where the rod's nodes accelerate by (x - x_free) / h^2.
   PALPATE double residual(const double* x, double h) const {
+    const Divisor square(h * h);
     double sum = rest();
     for (int k = 0; k < DOFS; ++k) {
       if (J()[k] == 0.0) continue;
       const int at = 3 * node() + k;
-      sum += J()[k] * (x[at] - f.start.data[at] - h * f.vel.data[at]) / (h * h);
+      sum += J()[k] * (x[at] - f.start.data[at] - h * f.vel.data[at]) / square;
     }
     for (int k = 0; k < REACH && body() >= 0; ++k)
-      if (B()[k] != 0.0) sum += B()[k] * x[3 * body() + k] / (h * h);
+      if (B()[k] != 0.0) sum += B()[k] * x[3 * body() + k] / square;
     return sum;
   }
 };
