@@ -34,14 +34,14 @@ _LANES = 32  # threads of a world
 _OF_DOFS = {name for name, dims in DIMS[layout.RodState.key].items() if dims == ("nv",)}
 # What of these fields are those of `rods.Bound`.
 _OF_BOUND = ("flex", "rest", "dofadr", "qposadr", "bodyid", "massadr", "own_dof", "dof_tree",
-             "geom_tree", "frame", "nv")  # fmt: skip
+             "dof_first", "dof_vertex", "geom_tree", "frame", "nv")  # fmt: skip
 _ITERATIONS = 60  # of a step, at most: all worlds wait for the one that takes longest
 
 
 @theirs(
   "contact_",
   option="gravity",
-  model="M_rowadr M_rownnz M_colind dof_damping",
+  model="M_rowadr M_rownnz M_colind dof_damping flex_dim body_invweight0",
   data="qpos qvel qfrc_applied xfrc_applied qfrc_passive qfrc_actuator qfrc_smooth qacc "
   "qacc_warmstart M nefc",
   contact="dim flex elem geom friction",
@@ -77,7 +77,7 @@ def most_contacts(space: rods.Workspace) -> int:
 
 def bytes_of(space: rods.Workspace) -> float:
   """Returns about how many bytes a world takes of a thread."""
-  return float(sum(8 * each.size for each in rods.scratch(len(space.organ.rest), 0).values()))
+  return float(sum(8 * each.size for each in rods.scratch(space.organ, 0).values()))
 
 
 class Thread(thread.Thread):
@@ -107,7 +107,7 @@ class Thread(thread.Thread):
       for name, span in spans.items()
     }
     self._broken = own["broken"]
-    scratch = rods.scratch(n, bare.nv).items()
+    scratch = rods.scratch(organ, bare.nv).items()
     each = {name: _rows(Rod, name, start, nworld, device) for name, start in scratch}
     self.iterations = each["status"]
     self.ties = Ties(nworld, device)
@@ -128,6 +128,7 @@ class Thread(thread.Thread):
       massadr=np.where(organ.free[:, None], (bare.M_rowadr + bare.M_rownnz - 1)[dofs], -1),
       own_dof=own_dof,
       dof_tree=bare.dof_treeid,
+      **rods.vertices(lambda name: getattr(bare, name)),
       geom_tree=bare.body_treeid[bare.geom_bodyid],
       qpos0=bare.qpos0,
       now=np.tile(organ.rest, (nworld, 1, 1)),

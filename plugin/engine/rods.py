@@ -7,6 +7,7 @@ coupling (`coupling/rod.h`) of its own, in doubles on the CPU.
 import dataclasses
 import functools
 import zlib
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -24,7 +25,9 @@ from .model import declare, flexes, mjstruct, prepare
 from .workspace import Report, Seen
 
 _MOST_ROWS = 48  # of MuJoCo's constraints, for one node
-_MOST_BODIES = 12  # nodes that stand for bodies which yield, three of their coordinates each
+# Nodes that stand for bodies which yield, three of their coordinates each, and for vertices of
+# organs, where it may meet some.
+_MOST_BODIES, _MOST_VERTICES = 12, 48
 # Centre lines come no nearer than this share of the diameter; neighbours along the thread, with no
 # more than this many radii between them, are not looked at.
 CORE, NEIGHBOURS = 0.5, 3.5
@@ -35,13 +38,13 @@ _MOST_PAIRS = 32  # of edges near each other, for one node
 _SOFT = 0.05  # modulus across a thread over that along it, an estimate
 _SLOW = 1e-6  # velocity below which friction within a thread is viscous [m/s]
 _MUJOCOS = (
-  *("jacobian", "flex_margin", "qvel", "qacc", "qacc_warmstart", "qfrc_smooth", "qfrc_actuator"),
-  *("M_rowadr", "M_rownnz", "M_colind", "dof_damping"),
+  *("jacobian", "flex_margin", "flex_dim", "qvel", "qacc", "qacc_warmstart", "qfrc_smooth"),
+  *("qfrc_actuator", "body_invweight0", "M_rowadr", "M_rownnz", "M_colind", "dof_damping"),
 )
 _WRITTEN = (
   *("start", "vel", "external", "aim", "place", "turn", "force", "move", "trial", "gradient"),
   *("matrix", "inverse", "rank", "near", "ranked", "first", "start_of_row", "last", "below"),
-  *("status", "count", "smooth", "reach", "listed", "pair", "pressure", "touch"),
+  *("status", "count", "smooth", "reach", "listed", "pair", "pressure", "touch", "stands"),
   *("row_kind", "row_node", "row_efc", "row_tree", "row_yields", "row_body"),
   *("row_value", "grip", "known", "speed"),
 )
@@ -56,7 +59,8 @@ class Rod:
   newton: int  # most iterations of a step
   twists: int  # whether it resists twisting
   most_rows: int  # MuJoCo's rows that there is room for
-  most_nodes: int  # nodes that there is room for, with those that stand for bodies
+  most_nodes: int  # nodes that there is room for, with those that stand for bodies and vertices
+  most_vertices: int  # vertices of organs that there is room for
   collides: int  # whether it meets itself
   most_pairs: int  # pairs of its edges that there is room for
   shortest: float  # length of its shortest edge [m]
@@ -107,8 +111,10 @@ class Rod:
   row_kind: ints("nrow")  # see `RowKind`
   row_node: ints("nrow")  # the first of the two nodes
   row_efc: ints("nrow")  # its number in MuJoCo
-  row_tree: ints("nrow")  # tree of bodies that it reaches, -1 for none, -3 if these do not yield
-  row_yields: ints("nrow")  # first of the nodes that stand for that, or -1
+  row_tree: ints("nrow")  # tree of bodies that it reaches, -1 for none, -3 if these do not yield,
+    # -4 for vertices of an organ
+  row_yields: ints("nrow", 4)  # nodes that stand for what yields, then -1
+  stands: ints("nplace")  # first dof of the vertex of an organ that a node stands for, or -1
   row_body: doubles("nrow", 12)  # J of these
   row_value: doubles("nrow", 9)  # J of their dofs; J a of other bodies less aref; D; friction
   grip: ints("nnode")  # tree of bodies that holds a node or one near it, or -1
@@ -133,6 +139,8 @@ class Bound:
   massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
   own_dof: ints("nv")  # number of a dof in the rod: three times the node, and the axis; or -1
   dof_tree: ints("nv")  # tree of bodies that a dof is of
+  dof_first: ints("nv")  # the first dof of its body
+  dof_vertex: ints("nv")  # body of the vertex of an organ that it is of; 0 of others
   geom_tree: ints("ngeom")  # and a geom, -1 if it does not move
   frame: doubles(3, 3)  # rotation from the slides' axes to the world
   mj: Mujoco
@@ -162,6 +170,7 @@ class Declaration:
     qposadr: first qpos, -1 if pinned             (nvert,)
     frame: rotation from the slides' axes to the world (3, 3)
     origin: position of the parent body [m]       (3,)
+    most_vertices: vertices of organs that there is room for in its step
   """
 
   name: str
@@ -175,6 +184,7 @@ class Declaration:
   qposadr: np.ndarray
   frame: np.ndarray
   origin: np.ndarray
+  most_vertices: int
 
   @functools.cached_property
   def signature(self) -> float:
@@ -224,7 +234,14 @@ def read(model: int, instance: int) -> Declaration:
   except ValueError as error:
     raise ValueError(str(error).replace("organ ", "thread ", 1)) from None
   dofadr, qposadr = declare.addresses(m, name, body, free)
-  return Declaration(name, flex, config, radius, rest, free, body, dofadr, qposadr, frame, origin)
+  kind, aims, dim = (
+    mjstruct.array(m, name) for name in ("flex_contype", "flex_conaffinity", "flex_dim")
+  )
+  meets = (kind[flex] & aims | kind & aims[flex]) * (dim > 1)
+  most = _MOST_VERTICES if meets.any() else 0
+  return Declaration(
+    name, flex, config, radius, rest, free, body, dofadr, qposadr, frame, origin, most
+  )
 
 
 def settings(organ: Declaration, friction: float) -> dict:
@@ -235,7 +252,8 @@ def settings(organ: Declaration, friction: float) -> dict:
   return dict(
     newton=organ.config.iterations,
     most_rows=_MOST_ROWS * n,
-    most_nodes=n + _MOST_BODIES,
+    most_nodes=n + _MOST_BODIES + organ.most_vertices,
+    most_vertices=organ.most_vertices,
     most_pairs=_MOST_PAIRS * n,
     collides=1,
     radius=organ.radius,
@@ -247,9 +265,23 @@ def settings(organ: Declaration, friction: float) -> dict:
   )
 
 
-def scratch(n: int, nv: int) -> dict[str, np.ndarray]:
-  """Returns the fields of `Rod` that a step of n nodes among nv dofs writes."""
-  most = n + _MOST_BODIES
+def vertices(array: Callable[[str], np.ndarray]) -> dict[str, np.ndarray]:
+  """Returns the fields of `Bound` that say which dofs are of vertices of organs.
+
+  Args:
+    array: returns an array of the model by its name
+  """
+  of, vertex = array("dof_bodyid"), array("flex_vertbodyid")
+  count = np.diff(np.append(array("flex_vertadr"), len(vertex)))  # those that wait for cuts too
+  vertex = vertex[np.repeat(array("flex_dim"), count) > 1]
+  vertex = vertex[array("body_dofnum")[vertex] == 3]
+  return {"dof_first": array("body_dofadr")[of], "dof_vertex": np.where(np.isin(of, vertex), of, 0)}
+
+
+def scratch(organ: Declaration, nv: int) -> dict[str, np.ndarray]:
+  """Returns the fields of `Rod` that a step of a thread among nv dofs writes."""
+  n = len(organ.rest)
+  most = n + _MOST_BODIES + organ.most_vertices
   sizes = {"nnode": n, "nplace": most, "nunknown": 4 * most, "npair": _MOST_PAIRS * n}
   sizes |= {"nrow": _MOST_ROWS * n, "nentry": 2 * most * (4 * most + 1), "nv": nv}
   return zeros(_WRITTEN, sizes | {"nword_node": -(-most // 32)}, (Rod,))
@@ -317,7 +349,7 @@ class Workspace:
     self.friction = float(mjstruct.view(m.flex_friction, (m.nflex, 3))[organ.flex, 0])
     self.constants = rod.constants(organ.rest, organ.radius, organ.config, mass, organ.clamped)
     self.own = layout.carve(RodState, self.state, sizes)
-    values = self.constants | settings(organ, self.friction) | scratch(n, m.nv)
+    values = self.constants | settings(organ, self.friction) | scratch(organ, m.nv)
     self.ties = coupling.ties(self.data, organ.flex)
     self.ties.lead = self._lead
     values |= {"mass": mass, "own": self.own}
@@ -333,6 +365,7 @@ class Workspace:
       massadr=np.where(organ.free[:, None], coupling.mass_addresses(m, dofs), -1),
       own_dof=own_dof,
       dof_tree=mjstruct.view(m.dof_treeid, m.nv, np.int32),
+      **vertices(functools.partial(mjstruct.array, m)),
       geom_tree=mjstruct.view(m.body_treeid, m.nbody, np.int32)[
         mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
       ],

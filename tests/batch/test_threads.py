@@ -114,7 +114,8 @@ def test_a_thread_over_an_organ_is_borne_by_it(device):
   worlds.set_state(1, there)
   worlds.step(2)
   first, second = worlds.thread("t").xpos.numpy()
-  np.testing.assert_allclose(first, second, atol=1e-5)
+  # With what force the thread pressed on which vertex is not in a state.
+  np.testing.assert_allclose(first, second, atol=1e-4)
 
 
 @SLOW

@@ -1,5 +1,7 @@
 """Threads through an organ: how they slide, hold cuts closed, and tear the tissue."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import palpate
@@ -413,7 +415,7 @@ def test_a_knot_does_not_go_through_a_hole(knotted):
   palpate.add_needle(spec, length=LENGTH, parent=hand, thread="suture")
   spec.equality("needle_suture").active = False
   surface, rim = sheet()
-  given = SHEET | {"foundation": 3e7, "pin": rim, "device": "cpu"}
+  given: dict[str, Any] = SHEET | {"foundation": 3e7, "pin": rim, "device": "cpu"}
   palpate.add_organ(spec, surface, needles=f"needle {ENERGY}", **given)
   model, data, organ = load(spec)
   thread = palpate.Thread(model, data, "suture")
@@ -437,3 +439,42 @@ def test_a_knot_does_not_go_through_a_hole(knotted):
   assert organ.pinholes[0].along == pytest.approx(place, abs=0.1 * edge)
   assert organ.pinholes[0].force[2] == pytest.approx(-1.2 + 0.009, rel=0.02)
   assert knots.throws(knots.closed(thread.positions)) == tied
+
+
+def test_a_thread_rests_on_the_wall_beside_its_hole():
+  """Drawn over the wall, it presses on it, loses some of the pull by friction, and comes to rest.
+
+  Beside the hole it is stiff in some directions and slack in others, and the wall is light: its
+  tension was up to 14 times the pull there, another one in each step.
+  """
+  edge, force = 4.5e-4, 0.1
+  line = np.array([(1e-3, 5e-4, -0.02), (1e-3, 5e-4, 5e-4), (9e-3, 5e-4, 8e-4)])
+  count = int(np.linalg.norm(np.diff(line, axis=0), axis=1).sum() / edge) + 1
+  spec = mujoco.MjSpec()
+  spec.option.timestep, spec.option.gravity = STEP, (0, 0, 0)
+  spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+  straight = line[0] + edge * np.arange(count)[:, None] * (0, 0, 1)
+  contact = {"margin": 6e-4, "friction": 0.3}
+  palpate.add_thread(spec, straight, "suture", strength=0, drag=2e-3, contact=contact)
+  hand = spec.worldbody.add_body(name="hand", pos=line[0] + (0, RADIUS, 0))
+  palpate.add_needle(spec, length=LENGTH, parent=hand, thread="suture")
+  spec.equality("needle_suture").active = False
+  surface, rim = sheet(15)
+  latex = {"mass": 5e-4, "young": 1e6, "thickness": 5e-4, "damping": 3e-3, "pin": rim}
+  palpate.add_organ(spec, surface, needles="needle 10000 600", device="cpu", **latex)
+  model, data, organ = load(spec)
+  thread = palpate.Thread(model, data, "suture")
+  thread.lay(line)
+  organ.sew("needle")
+  ends = {0: np.array([0, 0, -force]), count - 1: force * np.array([1.0, 0, -0.1])}
+  for start, stop, steps in ((0.01, 1.0, 300), (1.0, 1.0, 200)):
+    for _ in pull(model, data, ends, start, stop, steps):
+      pass
+  taut, fastest = [], 0.0
+  for _ in pull(model, data, ends, 1.0, 1.0, 50):
+    taut.append(thread.tension.copy())
+    fastest = max(fastest, float(np.abs(data.qvel).max()))
+  assert organ.contact_force[:, 2].sum() < -5e-3  # it lies on the wall
+  assert np.max(taut) < 1.05 * force
+  assert fastest < 2e-3  # [m/s]
+  assert 0.7 * force < np.min(taut[-1]) < 0.95 * force

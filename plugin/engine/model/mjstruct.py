@@ -130,6 +130,13 @@ def view(address: int | None, shape: Any, dtype: type = np.float64) -> np.ndarra
   return np.frombuffer(buffer, dtype).reshape(sizes)
 
 
+def array(m: Struct, name: str) -> np.ndarray:
+  """Returns the array of an mjModel that has a name, without a copy."""
+  kind, extents = declared(name)
+  shape = [getattr(m, n) if isinstance(n, str) else n for n in extents]
+  return view(getattr(m, name), shape, np.dtype(kind).type)
+
+
 def config(model: int, instance: int, key: str) -> str:
   """Returns a plugin instance's configuration value, empty where it is not set."""
   value = library().mj_getPluginConfig(model, instance, key.encode())

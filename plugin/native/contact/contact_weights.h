@@ -78,6 +78,16 @@ PALPATE void put(const Fields& f, char* contact, Rows rows, int side, D3 pos, D3
   }
 }
 
+// Whether a contact is between a thread and another thing: the thread's step, which may be over by now, sees to its rows.
+template <class Fields>
+PALPATE bool is_threads(const Fields& f, const char* contact) {
+  const auto is_thread = [&](int side) {
+    const int flex = side_of(contact, CONTACT_FLEX, side);
+    return flex >= 0 && f.flex_dim.data[flex] == 1;
+  };
+  return is_thread(0) != is_thread(1);
+}
+
 // Gives the corners of the triangle on one side of a contact their weights.
 template <class Fields>
 PALPATE void weigh_side(const Fields& f, char* contact, Rows rows, int side) {
@@ -114,7 +124,8 @@ PALPATE void weigh_side(const Fields& f, char* contact, Rows rows, int side) {
             {dot(along, load(slides)), dot(along, load(slides + 6)), dot(along, load(slides + 12))});
     }
   }
-  if (from > 0.0 && to > 0.0) scale_impedance(f, rows, to / from);
+  // A thread's step has found the force of its contacts.
+  if (from > 0.0 && to > 0.0 && !is_threads(f, contact)) scale_impedance(f, rows, to / from);
 }
 
 // The normal of the triangle on a side of a contact, outward.
@@ -190,16 +201,6 @@ PALPATE double ahead(const Fields& f, const char* contact) {
     if (flex >= 0 && f.mine.data[flex] && f.flex_dim.data[flex] == 1) return f.flex_margin.data[flex];
   }
   return 0.0;
-}
-
-// Whether a contact is between a thread and a geom: the thread's step, which may be over by now, sees to its rows.
-template <class Fields>
-PALPATE bool is_threads(const Fields& f, const char* contact) {
-  for (int side = 0; side < 2; ++side) {
-    const int flex = side_of(contact, CONTACT_FLEX, side);
-    if (flex >= 0 && f.flex_dim.data[flex] == 1 && side_of(contact, CONTACT_GEOM, 1 - side) >= 0) return true;
-  }
-  return false;
 }
 
 // Gives contacts with an organ their rows, and flags that what MuJoCo has computed of them for its dual

@@ -1,6 +1,6 @@
 // A rod among MuJoCo's own dofs, in MuJoCo's memory.
 #pragma once
-#include "contact/contact_rows.h"
+#include "contact/contact_weights.h"
 #include "coupling/rod.h"
 
 AS_WRITTEN
@@ -36,6 +36,7 @@ struct MujocoRod {
     return f.mj.qfrc_applied.data[dof] + f.mj.qfrc_passive.data[dof] + f.qfrc_actuator.data[dof];
   }
   PALPATE double damping(int dof) const { return f.dof_damping.data[dof]; }
+  PALPATE double invweight(int body) const { return f.body_invweight0.data[2 * body]; }
   PALPATE double last_acceleration(int dof) const { return f.qacc_warmstart.data[dof]; }
 
   PALPATE bool moves(int i) const { return f.dofadr.data[i] >= 0; }
@@ -98,16 +99,18 @@ struct MujocoRod {
         return 0;
       }
       const double margin = f.flex_margin.data[f.flex];
-      const bool organ = side_of(contact, CONTACT_FLEX, 0) >= 0 && side_of(contact, CONTACT_FLEX, 1) >= 0;
-      if (organ)
+      if (*(const double*)(contact + CONTACT_DIST) >= OPEN) return 0;  // with the tissue that it is in
+      const Other other = other_of(f, (const int*)(contact + CONTACT_FLEX));
+      if (other != A_BODY)
         keep_closed(f, contact, rows, margin);
       else
         set_gap(f, rows, *(const double*)(contact + CONTACT_DIST) + margin);
       return note_contact(*this, at, rows.first, rows.count, !rows.paired && rows.count > 1,
-                          *(const double*)(contact + CONTACT_MU), (const double*)(contact + CONTACT_FRICTION), !organ);
+                          *(const double*)(contact + CONTACT_MU), (const double*)(contact + CONTACT_FRICTION), other);
     });
     const int* type = datum<int*>(f, DATA_EFC_TYPE);
     note_joints(*this, nefc, type);
+    yield_vertices(*this);
     yield_trees(*this, h, nefc, type, datum<int*>(f, DATA_EFC_ID));
   }
 

@@ -8,8 +8,8 @@
 //
 //   qfrc_passive = M (v1 - v) / h - f_ext - f_c.
 //
-// Rows that reach what the rod's step cannot move, such as the nodes of an organ, are FREE: MuJoCo finds their force
-// anew. Then the nodes have in it the inertia Mhat that one node alone has in the rod's step, in place of M, and by
+// Vertices of an organ yield too. Rows that reach what the rod's step cannot move, such as another rod, are FREE: MuJoCo
+// finds their force anew. Then the nodes have in it the inertia Mhat that one node alone has in the rod's step, in place of M, and by
 // what the force differs the rod moves on by its own response A. An error of a body of mass M becomes
 // (A - Mhat) / (M + Mhat) of it, and one of the rod Mhat M / ((M + Mhat) A): so Mhat is that of the direction in
 // which the rod gives way most.
@@ -28,9 +28,20 @@ namespace palpate {
 template <class Number>
 struct RowOf { Number* value; const int* dof; int count; };
 
-// The first node of the rod that a row reaches, or NOWHERE, or APART: more than two that are neighbours.
+// In place of a node of the rod: of a row that reaches none, and of one that reaches more than two that are neighbours.
 constexpr int NOWHERE = -1, APART = -2;
-constexpr int FREE = -3;  // in place of a tree: of a row whose force MuJoCo finds
+// In place of a tree: of a row whose force MuJoCo finds, and of one that reaches vertices of an organ.
+constexpr int FREE = -3, VERTICES = -4;
+enum Other { A_BODY, AN_ORGAN, A_ROD };  // what a contact is with
+
+// What it is, by the flexes of both sides, -1 for a geom.
+template <class Fields>
+PALPATE Other other_of(const Fields& f, const int* flex) {
+  const int other = flex[flex[0] == f.flex];
+  return other < 0 ? A_BODY : f.flex_dim.data[other] == 1 ? A_ROD : AN_ORGAN;
+}
+
+// The first node of the rod that a row reaches, or what is in place of it.
 template <class Host, class Row>
 PALPATE int first_node(const Host& host, Row row) {
   int first = -1, last = -1;
@@ -193,7 +204,7 @@ PALPATE int note_row(const Host& host, int at, int r, int kind, double friction,
   rod.row_kind.data[at] = kind;
   rod.row_efc.data[at] = r;
   rod.row_tree.data[at] = tree;
-  rod.row_yields.data[at] = NOWHERE;
+  for (int k = 0; k < STANDINS; ++k) rod.row_yields.data[STANDINS * at + k] = NOWHERE;
   return node;
 }
 
@@ -229,10 +240,10 @@ PALPATE void note_grips(const Host& host, int nefc, const int* type) {
 }
 
 // Notes the rows of a contact from the rod's row `before` on, of a cone where `mu` says so, whole or not at all; returns
-// how many there are. `yields`: its other side does.
+// how many there are.
 template <class Host, class Number>
 PALPATE int note_contact(
-    const Host& host, int before, int first, int count, bool cone, double mu, const Number* friction, bool yields) {
+    const Host& host, int before, int first, int count, bool cone, double mu, const Number* friction, Other other) {
   int noted = 0, node = NOWHERE;
   for (int k = 0; k < count; ++k) {
     const double slope = !cone ? 0.0 : k ? (double)friction[k - 1] : mu;
@@ -247,7 +258,7 @@ PALPATE int note_contact(
   int reached = NOWHERE;
   const int end = before < 0 ? before : before + noted < host.rod.most_rows ? before + noted : host.rod.most_rows;
   for (int at = before; at < end; ++at) reached = tree[at] > reached ? tree[at] : reached;
-  for (int at = before; at < end; ++at) tree[at] = yields ? reached : FREE;
+  for (int at = before; at < end; ++at) tree[at] = other == A_BODY ? reached : other == AN_ORGAN ? VERTICES : FREE;
   return noted;
 }
 
@@ -279,7 +290,11 @@ PALPATE void yield_tree(const Host& host, int first, double h, int nefc, const i
     return rod.row_tree.data[first + k] == tree && other.lacks(host.row(own));
   };
   each_in_turn<int>(n - first, adds, [&](int r) { other.take(host.row(r)); });
-  one_lane([&] { rod.count.data[3] += (other.count + 2) / 3; });
+  const int stands = (other.count + 2) / 3;
+  one_lane([&] {
+    for (int k = 0; k < stands; ++k) rod.stands.data[node + k] = NOWHERE;
+    rod.count.data[3] += stands;
+  });
   other.weigh(h);
   other.hold(nefc, type, id);
   other.factorize();
@@ -295,7 +310,79 @@ PALPATE void yield_tree(const Host& host, int first, double h, int nefc, const i
         rest += row.value[k] * (rod.own.accelerated.data[d] - host.last_acceleration(d));
     }
     for (int a = 0; a < other.count; ++a) rest += J[a] * other.change[a];
-    rod.row_yields.data[at] = node;
+    for (int k = 0; k < stands; ++k) rod.row_yields.data[STANDINS * at + k] = node + k;
+  });
+}
+
+// The node that stands for a vertex of an organ whose first dof is told, or NOWHERE if there is no room for one.
+template <class Rod>
+PALPATE int stand_in(const Rod& rod, int dof) {
+  const int n = nodes_of(rod);
+  for (int node = rod.nnode; node < n; ++node)
+    if (rod.stands.data[node] == dof) return node;
+  if (n - rod.nnode >= rod.most_vertices) return NOWHERE;
+  rod.stands.data[n] = dof;
+  rod.count.data[3] += 1;
+  return n;
+}
+
+// Lets the vertices of an organ that the rod's rows `first` up to `end` of a contact reach yield; returns whether there
+// was room. Each yields as if its mass were alone. The tissue around it makes it heavier, in some directions a thousand
+// times: it then gives way less than expected, and forces grow within a few steps to what they are. With more inertia
+// than it has they would alternate and grow. What else acts on it does so as in the last step.
+template <class Host>
+PALPATE bool yield_contact(const Host& host, int first, int end) {
+  const auto& rod = host.rod;
+  int node[STANDINS], count = 0;
+  const auto each_dof = [&](int at, auto&& act) {
+    const auto row = host.row(rod.row_efc.data[at]);
+    for (int k = 0; k < row.count; ++k) {
+      const int d = row.dof ? row.dof[k] : k;
+      if (row.value[k] != 0.0 && host.own_dof(d) < 0) act(d, (double)row.value[k]);
+    }
+  };
+  bool room = true;
+  for (int at = first; at < end; ++at)
+    each_dof(at, [&](int d, double) {
+      if (!host.f.dof_vertex.data[d] || !room) return;
+      const int stands = stand_in(rod, host.f.dof_first.data[d]);
+      for (int c = 0; c < count; ++c)
+        if (node[c] == stands) return;
+      if (stands < 0 || count == STANDINS) room = false;
+      else node[count++] = stands;
+    });
+  for (int at = first; at < end && room; ++at) {
+    double* B = rod.row_body.data + REACH * at;
+    double& rest = rod.row_value.data[(DOFS + 3) * at + DOFS];
+    for (int k = 0; k < REACH; ++k) B[k] = 0.0;
+    for (int c = 0; c < count; ++c) rod.row_yields.data[STANDINS * at + c] = node[c];
+    each_dof(at, [&](int d, double value) {
+      rest += value * (rod.own.accelerated.data[d] - host.last_acceleration(d));
+      for (int c = 0; c < count; ++c) {
+        const int axis = d - rod.stands.data[node[c]];
+        if (axis < 0 || axis > 2) continue;
+        const double per_mass = host.invweight(host.f.dof_vertex.data[d]);
+        B[3 * c + axis] = sqrt(per_mass) * value;
+        rest -= per_mass * value * rod.own.pushed.data[d];
+      }
+    });
+  }
+  return room;
+}
+
+// Lets all do that the noted rows reach. Rows for which there is no room are free.
+template <class Host>
+PALPATE void yield_vertices(const Host& host) {
+  const auto& rod = host.rod;
+  one_lane([&] {
+    const int n = rod.count.data[0];
+    int end;
+    for (int first = 0; first < n; first = end) {
+      end = first + 1;
+      while (end < n && rod.row_kind.data[end] == FRICTION) ++end;
+      if (rod.row_tree.data[first] != VERTICES || yield_contact(host, first, end)) continue;
+      for (int at = first; at < end; ++at) rod.row_tree.data[at] = FREE;
+    }
   });
 }
 
@@ -304,7 +391,7 @@ template <class Host>
 PALPATE void yield_trees(const Host& host, double h, int nefc, const int* type, const int* id) {
   const auto& rod = host.rod;
   for (int r = 0; r < rod.count.data[0]; ++r)
-    if (rod.row_tree.data[r] >= 0 && rod.row_yields.data[r] < 0) yield_tree(host, r, h, nefc, type, id);
+    if (rod.row_tree.data[r] >= 0 && rod.row_yields.data[STANDINS * r] < 0) yield_tree(host, r, h, nefc, type, id);
 }
 
 template <class Rod>
@@ -433,17 +520,18 @@ PALPATE void break_edge(const Rod& rod) {
   });
 }
 
-// Keeps what pushed other bodies, and how they accelerated.
+// Keeps what pushed other bodies, of an organ's vertices what the rod did, and how they accelerated.
 template <class Host>
 PALPATE void note_pushed(const Host& host, double h) {
   const auto& rod = host.rod;
   each_lane(0, host.f.nv, [&](int d) {
-    rod.own.pushed.data[d] = rod.known.data[d];
+    rod.own.pushed.data[d] = host.f.dof_vertex.data[d] ? 0.0 : rod.known.data[d];
     rod.own.accelerated.data[d] = (host.speed(d) - rod.speed.data[d]) / h;
   });
   const auto pushes = [&](int at, int& r) {
     r = rod.row_efc.data[at];
-    return rod.row_tree.data[at] >= 0 && host.force(r) != 0.0;
+    const int tree = rod.row_tree.data[at];
+    return (tree >= 0 || tree == VERTICES) && host.force(r) != 0.0;
   };
   each_in_turn<int>(rod.count.data[0], pushes, [&](int r) {
     const auto row = host.row(r);

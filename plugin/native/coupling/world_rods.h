@@ -37,6 +37,10 @@ struct WorldRod {
   PALPATE double damping(int dof) const {
     return f.dof_damping.data[(size_t)(world % f.dof_damping.shape[0]) * f.nv + dof];
   }
+  PALPATE double invweight(int body) const {
+    const auto& shape = f.body_invweight0.shape;
+    return ((const float*)f.body_invweight0.data)[2 * ((size_t)(world % shape[0]) * shape[1] + body)];
+  }
   PALPATE double last_acceleration(int dof) const { return f.qacc_warmstart.data[dof]; }
 
   PALPATE bool moves(int i) const { return f.dofadr.data[i] >= 0; }
@@ -99,9 +103,10 @@ struct WorldRod {
       }
       const float* friction = (const float*)f.contact_friction.data + 5 * c;
       return note_contact(*this, at, r, count, !paired && count > 1, friction[0] / sqrt(f.impratio), friction,
-                          geom[0] >= 0 || geom[1] >= 0);
+                          other_of(f, flex));
     });
     note_joints(*this, nefc, type);
+    yield_vertices(*this);
     yield_trees(*this, h, nefc, type, f.id.data);
   }
 

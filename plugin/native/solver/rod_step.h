@@ -37,8 +37,13 @@ struct RodRow {
   PALPATE double rest() const { return J()[DOFS]; }      // what other bodies add, less aref
   PALPATE double D() const { return J()[DOFS + 1]; }
   PALPATE double friction() const { return J()[DOFS + 2]; }  // of a cone's first row, its mu
-  // What yields to it: the first node that stands for that, or less than 0, and the row of these.
-  PALPATE int body() const { return f.row_yields.data[r]; }
+  // What yields to it: the nodes that stand for that, then less than 0, and the row of these.
+  PALPATE int body(int k) const { return f.row_yields.data[STANDINS * r + k]; }
+  PALPATE int dofs() const {
+    int count = 0;
+    while (count < STANDINS && body(count) >= 0) ++count;
+    return DOFS + 3 * count;
+  }
   PALPATE const double* B() const { return f.row_body.data + REACH * r; }
   PALPATE double at(int c) const { return c < DOFS ? J()[c] : B()[c - DOFS]; }
 
@@ -51,8 +56,8 @@ struct RodRow {
       const int at = 3 * node() + k;
       sum += J()[k] * (x[at] - f.start.data[at] - h * f.vel.data[at]) / square;
     }
-    for (int k = 0; k < REACH && body() >= 0; ++k)
-      if (B()[k] != 0.0) sum += B()[k] * x[3 * body() + k] / square;
+    for (int k = 0; k < REACH && body(k / 3) >= 0; ++k)
+      if (B()[k] != 0.0) sum += B()[k] * x[3 * body(k / 3) + k % 3] / square;
     return sum;
   }
 };
@@ -66,8 +71,8 @@ PALPATE void add_row(
   const int node = at.node();
 #if ON_CUDA
   const auto value = [&](int a) { return a < DOFS ? J[a] : B[a - DOFS]; };
-  const auto which = [&](int a) { return a < DOFS ? node + a / 3 : at.body() + (a - DOFS) / 3; };
-  const int count = at.body() < 0 ? DOFS : DOFS + REACH;
+  const auto which = [&](int a) { return a < DOFS ? node + a / 3 : at.body((a - DOFS) / 3); };
+  const int count = at.dofs();
   each_lane(0, count, [&](int a) {
     if (value(a) != 0.0) g[4 * which(a) + a % 3] += force * value(a);
   });
@@ -79,15 +84,15 @@ PALPATE void add_row(
   const int last = node + 1 < f.nnode ? node + 1 : node - 1;  // at the end, of which there is nothing
   const int nodes[2] = {node, last};
   terms.scatter(nodes, g, *H);
-  for (int i = 0; i < REACH / 3 && at.body() >= 0; ++i) {
-    const int body = at.body() + i;
+  for (int i = 0; i < STANDINS && at.body(i) >= 0; ++i) {
+    const int body = at.body(i);
     const double* b = B + 3 * i;
     if (b[0] == 0.0 && b[1] == 0.0 && b[2] == 0.0) continue;
     for (int c = 0; c < 3; ++c) g[4 * body + c] += force * b[c];
     for (int k = 0; k < (node + 1 < f.nnode ? 2 : 1); ++k)
       H->add(body, 3, nodes[k], 3, [&](int c, int d) { return stiffness * b[c] * J[3 * k + d]; });
     for (int k = 0; k <= i; ++k)
-      H->add(body, 3, at.body() + k, 3, [&](int c, int d) { return stiffness * b[c] * B[3 * k + d]; });
+      H->add(body, 3, at.body(k), 3, [&](int c, int d) { return stiffness * b[c] * B[3 * k + d]; });
   }
 #endif
 }
@@ -120,7 +125,7 @@ CALLED double cone(const Fields& f, int r, int dim, const double* x, double h, d
   cost = 0.5 * Dm * off * off;
   if (!g) return cost;
   double v[DOFS + REACH] = {}, w[DOFS + REACH], tangent[DOFS + REACH] = {};
-  const int all = first.body() < 0 ? DOFS : DOFS + REACH;
+  const int all = first.dofs();
   for (int k = 0; k < dim; ++k) {
     const RodRow<Fields> row{f, r + k};
     for (int c = 0; c < all; ++c) {

@@ -13,8 +13,8 @@ constexpr double LEFT = 0.2, FOUND = 0.9;
 // node goes in a step.
 constexpr double LISTED = 2.0, AHEAD = 3.0;
 constexpr double STRETCHED = 1.2;  // more than an edge ever is
-// Most dofs of a tree of bodies that yields to the rod.
-constexpr int REACH = 12;
+// Most dofs of bodies that a row lets yield to the rod, and nodes that stand for these, three each.
+constexpr int REACH = 12, STANDINS = REACH / 3;
 
 // The points of two segments, from p along d and from q along e, that are nearest (Ericson 2005, 5.1.9).
 struct Nearest {
@@ -135,11 +135,11 @@ PALPATE void join_bodies(const Fields& f, Join join) {
   const int last = nodes_of(f);
   each_lane(f.nnode, last, [&](int i) { join(i, i); });
   each_lane(0, f.count.data[0], [&](int r) {
-    const int first = f.row_yields.data[r];
-    for (int body = first; first >= 0 && body < last && body < first + REACH / 3; ++body) {
-      join(body, f.row_node.data[r]);
-      if (f.row_node.data[r] + 1 < f.nnode) join(body, f.row_node.data[r] + 1);
-      for (int other = first; other < body; ++other) join(body, other);
+    const int* body = f.row_yields.data + STANDINS * r;
+    for (int k = 0; k < STANDINS && body[k] >= 0; ++k) {
+      join(body[k], f.row_node.data[r]);
+      if (f.row_node.data[r] + 1 < f.nnode) join(body[k], f.row_node.data[r] + 1);
+      for (int other = 0; other < k; ++other) join(body[k], body[other]);
     }
   });
 }
