@@ -53,8 +53,8 @@ def _corner(s: Common, w: int, k: int, middle: wp.vec3, size: float):
 
 
 @wp.func
-def _cross(s: Common, w: int, view: wp.mat33, note: bool):
-  """Returns how many crossings a picture of the thread has, and notes the first of them."""
+def _box(s: Common, w: int):
+  """Returns the middle of the nodes, and four times how far they spread [m, m]."""
   n = s.strand.shape[1]
   middle = wp.vec3()
   low = _node(s, w, 0)
@@ -64,8 +64,13 @@ def _cross(s: Common, w: int, view: wp.mat33, note: bool):
     middle += x / float(n)
     low = wp.min(low, x)
     high = wp.max(high, x)
-  size = 4.0 * wp.max(high - low)
-  whole = n + _MORE
+  return middle, 4.0 * wp.max(high - low)
+
+
+@wp.func
+def _cross(s: Common, w: int, view: wp.mat33, middle: wp.vec3, size: float, note: bool):
+  """Returns how many crossings a picture of the thread has, and notes the first of them."""
+  whole = s.strand.shape[1] + _MORE
   count = int(0)
   for i in range(whole - 2):
     a, b = view * _corner(s, w, i, middle, size), view * _corner(s, w, i + 1, middle, size)
@@ -143,10 +148,11 @@ def _determinant(s: Common, w: int, count: int, t: wp.float64):
 @wp.func
 def throw(s: Common, w: int):
   """Returns how often the thread is wound about itself in its one throw, see `rules.throw`."""
+  middle, size = _box(s, w)
   best = int(0)
   least = int(1 << 20)
   for k in range(s.views.shape[0]):
-    count = _cross(s, w, s.views[k], False)
+    count = _cross(s, w, s.views[k], middle, size, False)
     if count < least:
       best = k
       least = count
@@ -154,7 +160,7 @@ def throw(s: Common, w: int):
     return 0
   if least > _MOST:
     return -1
-  count = _cross(s, w, s.views[best], True)
+  count = _cross(s, w, s.views[best], middle, size, True)
   first = _determinant(s, w, count, wp.float64(-1.0))
   second = _determinant(s, w, count, wp.float64(2.0))
   while second >= wp.float64(2.0):
