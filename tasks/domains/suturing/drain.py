@@ -14,6 +14,7 @@ from palpate.models import mjcf
 
 from ...core import scenes
 from ...core.base import Physics, Task
+from ...core.rules import pierced, snapped, taut, vertex
 from ...core.scenes import BED, ORGAN, Scene
 from .. import sheet
 from .needles import RADIUS as CIRCLE
@@ -154,17 +155,6 @@ def beside(nodes: int) -> np.ndarray:
   return lips[np.abs(rest[lips[:, 0], 1]) < 0.25 * SLIT]
 
 
-def gap(places: np.ndarray, nodes: int) -> float:
-  """Returns how far the slit gapes at most beside the stitch, 0 where its lips overlap [m].
-
-  Args:
-    places: of the drain's vertices now [m]  (nvert, 3)
-    nodes: that it was made with, see `drain`
-  """
-  right, left = beside(nodes).T
-  return float((places[right, 0] - places[left, 0]).max(initial=0.0))
-
-
 def part(organ: palpate.Organ, nodes: int, force: float) -> None:
   """Lifts the wall on both sides of the stitch and pulls it apart, as a test of the knot.
 
@@ -188,17 +178,39 @@ def part(organ: palpate.Organ, nodes: int, force: float) -> None:
     data.xfrc_applied[near, :3] = force / len(near) * way
 
 
+def follow_stitch(s, o):
+  """Finds the gap, the tension, and whether the thread is whole and in its holes; a rule."""
+  count, pull = pierced(s)
+  o.whole = count == 2
+  o.broken = snapped(s)
+  o.tension = taut(s)
+  o.hardest = max(o.hardest, pull)
+  o.tightest = max(o.tightest, o.tension)
+  o.gap = 0.0
+  for k in range(o.lips.shape[0]):
+    o.gap = max(o.gap, float(vertex(s, o.lips[k, 0])[0] - vertex(s, o.lips[k, 1])[0]))
+  return o
+
+
 class Sewn(Task):
   """An exercise that draws a throw down on the drain.
 
   Attributes:
+    lips: vertices of both beside the stitch, see `beside`
     gap: of the slit now [m]
     tension: the largest of the thread [N]
+    hardest: largest pull on the drain so far [N], and `tightest`, largest tension
     broken: whether the thread is
     whole: whether it is in both of its holes
   """
 
   settles = 0.1  # the thread falls meanwhile, until it is laid
+
+  def __init__(self, *args, **kwargs):
+    """Looks for the lips; see Task."""
+    super().__init__(*args, **kwargs)
+    self.lips = beside(self.scene.nodes)
+    self.pairs = len(self.lips)
 
   def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
     """Returns all of the drain, and the middle of the stitch."""
@@ -206,23 +218,26 @@ class Sewn(Task):
 
   def begin(self, physics: Physics) -> None:
     """The slit gapes."""
-    self.gap, self.tension = GAPE, 0.0
+    self.gap, self.tension, self.tightest, self.hardest = GAPE, 0.0, 0.0, 0.0
+    self.whole, self.broken = True, False
 
   def look(self, physics: Physics) -> None:
-    """Finds the gap, the tension, and whether the thread is whole and in its holes."""
-    assert physics.thread
-    self.tension = float(physics.thread.tension.max())
-    self.broken = bool(physics.thread.broken.any())
-    self.whole = len(physics.organ.pinholes) == 2
-    self.gap = gap(physics.nodes(), self.scene.nodes)
+    """Finds how the stitch is now."""
+    follow_stitch(physics, self)
 
   def lost(self, physics: Physics) -> bool:
     """Returns whether the thread is broken or out of the drain: the exercise has failed then."""
     if not self.broken and self.whole:
       return False
     self.outcome = "damage"
-    self.event(physics, "note", label="thread broken" if self.broken else "torn out of the drain")
+    self.event(physics, "note", label=self.label("damage"))
     return True
+
+  def label(self, kind: str) -> str:
+    """Returns what an event of the rules is called."""
+    if kind == "damage":
+      return "thread broken" if self.broken else "torn out of the drain"
+    return "throw" if kind == "target" else super().label(kind)
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns gap, tension and the pull on the drain."""

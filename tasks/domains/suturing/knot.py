@@ -48,22 +48,18 @@ from ...core.rules import (
   in_hand,
   jaws,
   many,
-  pierced,
   reach,
-  snapped,
   strand,
   strands,
-  taut,
   throw,
   tip,
   vector,
-  vertex,
 )
 from ...core.scenes import Scene
 from ...core.stage import STATE, Stage
 from ...registry import exercise
 from . import drain
-from .drain import CLOSED, EDGE, GAPE, HANDS, MIDDLE, PULL, STAYS
+from .drain import CLOSED, EDGE, GAPE, HANDS, MIDDLE, PULL, STAYS, follow_stitch
 from .needles import between
 
 FIELD = Scene(
@@ -206,18 +202,10 @@ def begin(s, o):
 
 
 def follow(s, o):
-  """Finds what jaws hold, the gap, the tension, and now and then the throw."""
+  """Finds what jaws hold, how the stitch is, and now and then the throw."""
   for hand in range(2):
     o = follow_jaws(s, o, hand)
-  count, pull = pierced(s)
-  o.whole = count == 2
-  o.broken = snapped(s)
-  o.tension = taut(s)
-  o.hardest = max(o.hardest, pull)
-  o.tightest = max(o.tightest, o.tension)
-  o.gap = 0.0
-  for k in range(o.lips.shape[0]):
-    o.gap = max(o.gap, float(vertex(s, o.lips[k, 0])[0] - vertex(s, o.lips[k, 1])[0]))
+  o = follow_stitch(s, o)
   o.looked = o.looked + 1
   if o.looked % _LOOKS == 0:
     found = throw(s)
@@ -291,8 +279,6 @@ class Knot(drain.Sewn):
     self.turns, self.lean, self.aside = turns, _LEAN, _ASIDE
     # Jaws that close strike each other, and what they take, with 9 to 20 N in single steps.
     super().__init__(scene, random, **{"force_limit": 30.0, "damage": 60.0, **kwargs})
-    self.lips = drain.beside(self.scene.nodes)
-    self.pairs = len(self.lips)
 
   def line(self) -> np.ndarray:
     """Returns the line of the thread, from the end of its long tail  (4, 3)."""
@@ -343,8 +329,7 @@ class Knot(drain.Sewn):
     self.lean = _LEAN + self.random.uniform(-0.15, 0.15, 3)
     self.aside = _ASIDE + self.random.uniform(-1.0, 1.0, 3) * _OFF
     self.held, self.firm, self.anchors = np.full(2, -1), np.zeros(2, int), np.zeros((2, 3))
-    self.looked, self.whole, self.broken = 0, True, False
-    self.tied = self.stayed = self.hardest = self.tightest = 0.0
+    self.looked, self.tied, self.stayed = 0, 0.0, 0.0
     self.right_holds = self.left_holds = 0.0
     self.short_tail, self.long_tail, self.stitch = np.zeros((3, 3))
     self.place(physics)
@@ -368,12 +353,6 @@ class Knot(drain.Sewn):
   def still(self, hand: int) -> np.ndarray:
     """Returns what keeps the jaws closed."""
     return np.array([HOLD])
-
-  def label(self, kind: str) -> str:
-    """Returns what an event of the rules is called."""
-    if kind == "damage":
-      return "thread broken" if self.broken else "torn out of the drain"
-    return "throw" if kind == "target" else super().label(kind)
 
   def show(self, physics: Physics) -> None:
     """Marks nothing."""
