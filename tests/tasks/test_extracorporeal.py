@@ -7,6 +7,7 @@ from palpate.tasks import suite
 from palpate.tasks.batch.vector import Exercises, NotVectorisedError
 from palpate.tasks.core import episode, performer
 from palpate.tasks.domains.suturing import drain, extracorporeal
+from palpate.tasks.learn import lessons
 from palpate.tasks.metrics import knots
 from palpate.tasks.recording import Recording
 
@@ -53,6 +54,19 @@ def test_throws_that_are_drawn_tight_hold(level, who, seed, knot):
   assert made.outcome == "success" and env.task.knot == knot
   found = made.metrics()
   assert extracorporeal.PULL - 1e-6 < found.knot_security <= 2.0 and found.final_gap < 1e-3
+
+
+def test_a_teacher_goes_back_up_from_a_throw_that_another_has_pressed_home():
+  env = load("extracorporeal_standard")
+  timestep, act = env.reset(), lessons.Teacher(env)
+  while not env.task.seated:
+    timestep = env.step(act(timestep))
+    assert not timestep.last()
+  high, act = [], lessons.Teacher(env)
+  for _ in range(10):
+    timestep = env.step(act(timestep))
+    high.append(env.physics.hands[0].tip_pos()[2])
+  assert (np.diff(high[2:]) > 0).all() and high[-1] > high[0] + 0.003
 
 
 @pytest.mark.parametrize("turns", [1, 2])

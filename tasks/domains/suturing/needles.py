@@ -61,9 +61,9 @@ _SPEED, _TURN, _CLOSE = 0.03, 1.2, 3.0  # of an expert's hand [m/s, rad/s] and j
 _BACK, _UP, _HIGH = 0.01, 0.008, 0.006  # of hands off a needle, and of one over its mark [m]
 # Of a teacher: width of the cone over a goal, at its tip [m] and by height [-], how far a frame may
 # be turned there [rad], height of the cone and that jaws close from, how far off a hand has let go,
-# and how far back a needle is put right before it goes in [m].
+# off a needle that is still turned on, and how far back one is put right before it goes in [m].
 NARROW, TURNED = 0.0015, 0.2
-_CONE, _TALL, _CLOSES, _CLEAR, _FREE = 0.2, 0.032, 0.002, 0.02, 0.002
+_CONE, _TALL, _CLOSES, _CLEAR, _FAR_OFF, _FREE = 0.2, 0.032, 0.002, 0.02, 0.026, 0.002
 
 Pose = tuple[np.ndarray, np.ndarray]  # place [m] (3,), and frame in columns (3, 3)
 
@@ -401,17 +401,20 @@ def close_on(p: Performer, goal: Pose, off: np.ndarray) -> Script:
 
 def let_go(p: Performer) -> Script:
   """Opens the jaws and takes the hand back and aside."""
-  yield from leave(p, _away(p.turn), (park(p.trocar)[0], p.turn))
+  yield from leave(p, _away(p.turn), (park(p.trocar)[0], p.turn), _FAR_OFF)
 
 
-def leave(p: Performer, off: np.ndarray, end: Pose) -> Script:
-  """Opens the jaws, takes the hand off by a way [m]  (3,), and brings it to a pose."""
+def leave(p: Performer, off: np.ndarray, end: Pose, clear: float = _CLEAR) -> Script:
+  """Opens the jaws, takes the hand off by a way [m]  (3,), and brings it to a pose.
+
+  A teacher's hand that is clear of the needle [m] has gone far enough.
+  """
   if p.hasty:  # from where another has come to
     p.extra[:] = p.share()
   yield from jaws(p, WIDE)
 
   def gone() -> bool:
-    return p.hasty and not lingers(p)
+    return p.hasty and not lingers(p, clear)
 
   yield from come(move_tip(p, p.tip + off, p.turn), gone)
   yield from come(move_tip(p, *end), gone)
@@ -498,9 +501,9 @@ def height(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> float:
   return max(aside - NARROW, 0.0) + _FREE * max(turned, 1.0) if p.hasty else math.inf
 
 
-def lingers(p: Performer) -> bool:
-  """Returns whether a teacher's hand that let go is still at the needle."""
-  return p.hasty and away(p.physics, p.hand.tip_pos()) < _CLEAR
+def lingers(p: Performer, clear: float = _CLEAR) -> bool:
+  """Returns whether a teacher's hand that let go is still at the needle, nearer than so [m]."""
+  return p.hasty and away(p.physics, p.hand.tip_pos()) < clear
 
 
 def _turns_in(p: Performer, ends: np.ndarray, before: float) -> bool:

@@ -73,6 +73,7 @@ from .needles import (
   LOST,
   MARK,
   MEETS,
+  NARROW,
   OUT,
   QUARTER,
   RADIUS,
@@ -84,14 +85,17 @@ from .needles import (
   arc,
   arrive,
   carry,
+  come,
   grasped,
   half_angle,
   left_grasp,
   let_go,
   lingers,
   lowest,
+  needle,
   one,
   open_holes,
+  over,
   park,
   piercing,
   right_grasp,
@@ -118,6 +122,7 @@ _MASS, _SLOTS = 0.004, 160  # of the wall [kg], and of its window
 _HIGH, _PULL = 0.012, 0.7
 _MORE, _SHUT = 0.02, 0.7  # how the pull grows [N/s], and share of the limit at which it is enough
 _LITTLE, _DRAWN = 0.01, 0.03  # slack that is drawn in with care [m], and how fast more is [m/s]
+_UNDRAWN = 0.013  # slack of the seam that a teacher goes on to draw in [m]
 # How high it is handed over [m], tension of a thread without slack [N], and which way it is pulled.
 _OVER, _TAUT, _WAY = 0.02, 0.3, np.array([0.6, 0.35, 0.72])
 
@@ -408,9 +413,9 @@ class Running(Stitching):
         yield from one(p, p.other, self._pull(p.other, lambda: self.outcome is not None))
       elif out and self.left_holds and (self.right_holds or lingers(p)):
         yield from one(p, p, let_go(p))
-      elif self.left_holds and out:
+      elif self.left_holds and (out or (p.hasty and self._seam(p.physics) > _UNDRAWN)):
         yield from one(p, p.other, self._draw(p.other))
-      elif self.left_holds and self.right_holds:
+      elif not out and self.right_holds and (self.left_holds or lingers(p.other)):
         yield from one(p, p.other, let_go(p.other))
       elif self.left_holds:
         yield from one(p, p.other, self._hand(p.other))
@@ -459,11 +464,16 @@ class Running(Stitching):
 
   def _hand(self, p: Performer) -> Script:
     """Brings the needle over the next stitch, to where the right hand can take it."""
-    pos, mat = piercing(self._ends(p), math.radians(90.0))
-    pos = pos + np.array([0.0, 0.0, _OVER])
-    yield from carry(p, lambda t: (pos + np.array([0.0, 0.0, 0.01]), mat))
-    yield from carry(p, lambda t: (pos, mat))
-    yield from arrive(p)
+    up, (pos, mat) = np.array([0.0, 0.0, 1.0]), piercing(self._ends(p), math.radians(90.0))
+    goal = pos + _OVER * up, mat
+
+    def there() -> bool:
+      return over(p, needle(p.physics), goal, up)
+
+    yield from come(carry(p, lambda t: (goal[0] + 0.01 * up, mat)), there)
+    if not there() or needle(p.physics)[0][2] > goal[0][2] + NARROW:
+      yield from carry(p, lambda t: goal)
+      yield from arrive(p)
 
   def _pull(self, p: Performer, enough: Callable[[], bool]) -> Script:
     """Draws the thread through until it has little slack, and pulls at it until that is enough."""
@@ -486,6 +496,12 @@ class Running(Stitching):
     holes = physics.organ.needles[0].holes
     way = np.array([*(hole.at for hole in holes), arc(physics, 0.0)])
     return -holes[0].along - _along(way) if holes else 0.0
+
+  def _seam(self, physics: Any) -> float:
+    """Returns how much longer the thread is than the way from its first hole to its last [m]."""
+    holes = physics.organ.needles[0].holes
+    way = np.array([hole.at for hole in holes])
+    return holes[-1].along - holes[0].along - _along(way) if holes else 0.0
 
 
 def _seats(rest: np.ndarray, elem: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
