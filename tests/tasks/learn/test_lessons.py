@@ -58,7 +58,11 @@ def test_teachers_close_jaws_that_somebody_has_begun_to_close():
 
 @pytest.mark.parametrize(
   ("domain", "level"),
-  [("grasp", "easy"), ("needle", "transfer_easy"), ("suture", "running_easy")],
+  [
+    ("grasp", "easy"),
+    ("needle", "transfer_easy"),
+    pytest.param("suture", "running_easy", marks=pytest.mark.slow),
+  ],
 )
 def test_teachers_that_take_turns_are_as_quick_as_one(domain, level):
   env = tasks.load(domain, level, task_kwargs={"surroundings": "none"})
