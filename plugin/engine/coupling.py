@@ -213,6 +213,7 @@ class Ties:
     aims: by who holds it, what adds to these, and what follows once all have
     lead: lets the thread take its step before an organ's, given that's instance
     led: whether it has
+    again: lets it take that anew for the same, which has found the contacts again
   """
 
   def __init__(self, nworld: int = 1, device: Any = "cpu"):
@@ -228,6 +229,7 @@ class Ties:
     self.aims: dict[Any, tuple[Callable[[], None], Callable[[], None]]] = {}
     self.lead: Callable[[int], None] = lambda instance: None
     self.led = False
+    self.again: Callable[[int], None] = lambda instance: None
 
   def aim(self):
     """Fills the arrays."""
@@ -245,6 +247,12 @@ _ties: dict[tuple[int, int], Ties] = {}
 def ties(data: int, flex: int) -> Ties:
   """Returns what holds the thread of a flex in an mjData."""
   return _ties.setdefault((data, flex), Ties())
+
+
+def again(data: int, instance: int):
+  """Lets threads of an mjData take their steps anew that they have taken before an organ's."""
+  for tied in [each for key, each in _ties.items() if key[0] == data]:
+    tied.again(instance)
 
 
 def forget(data: int):

@@ -351,7 +351,7 @@ class Workspace:
     self.own = layout.carve(RodState, self.state, sizes)
     values = self.constants | settings(organ, self.friction) | scratch(organ, m.nv)
     self.ties = coupling.ties(self.data, organ.flex)
-    self.ties.lead = self._lead
+    self.ties.lead, self.ties.again = self._lead, self._again
     values |= {"mass": mass, "own": self.own}
     values |= {name: array[0] for name, array in self.ties.arrays.items()}
     own = fill(Rod, "cpu", values)
@@ -382,6 +382,8 @@ class Workspace:
         each.load(cpu)
       self._begin, self._end = begin.command(self.fields), end.command(self.fields)
     self._status = own.status.numpy().data
+    self._passive = mjstruct.view(mjstruct.Data.from_address(self.data).qfrc_passive, m.nv)
+    self._dofs = organ.dofs
     self.seen.signature = self.own.signature.numpy().data
     self.seen.identity = mjstruct.Identity(model)
     self.seen.warning = mjstruct.warnings(self.data)
@@ -404,6 +406,10 @@ class Workspace:
       return
     self.ties.aim()
     mjstruct.library().mj_fwdActuation(self._model, self.data)  # MuJoCo does so later
+    self._before = self._passive[self._dofs]
+    self._take()
+
+  def _take(self):
     self._begin.launch()
     self.report.computed = True
     if self._status[0] < 0:
@@ -413,6 +419,12 @@ class Workspace:
         f"a step was not solved in {self.organ.config.iterations} iterations: its forces are out "
         "of balance; a smaller time step or more of the key iterations may help"
       )
+
+  def _again(self, instance: int):
+    """Takes the step anew that it has taken before an organ's: its contacts have other rows now."""
+    if self.report.computed and (self.instance < instance or self.ties.led):
+      self._passive[self._dofs] = self._before
+      self._take()
 
   def _lead(self, instance: int):
     """Takes the step before that of an organ that holds it, where it does not anyway."""

@@ -277,6 +277,7 @@ def find_contacts_again(w: Workspace):
   """Does the position stage once more.
 
   It keeps the inertias of all other dofs: another organ may have raised its own in this step.
+  Threads that have taken theirs take it anew, from the rows that there are now.
   """
   m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
   other = np.ones(m.nv, bool)
@@ -288,6 +289,7 @@ def find_contacts_again(w: Workspace):
   safe_calls.find_contacts(w.model, w.data)
   for (array, which), were in zip(kept, values, strict=True):
     array[which] = were
+  coupling.again(w.data, w.seen.instance)
 
 
 def wake(host: Host):
