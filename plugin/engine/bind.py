@@ -145,7 +145,7 @@ def _touched(w: Workspace, model: int) -> contacts.Weights:
   flexes = declare_windows.touching(model, w.seen.instance)
   out = contacts.make(model, w.data, flexes, w.report.flags)
   out.mine.numpy()[w.organ.flexes] = 2
-  w.views["mine"], w.host.weights = out.mine, out
+  w.views["mine"], w.host.lift = out.mine, contacts.lift.command(out)
   return out
 
 

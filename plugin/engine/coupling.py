@@ -128,6 +128,7 @@ class Phases:
   def look_ahead(self):
     """Looks at the solution that was begun so, on `side`."""
 
+
 def memory(*names: str) -> Callable[[type], Any]:
   """Returns a decorator: a struct has MuJoCo's own memory under its own names as well.
 
@@ -246,7 +247,9 @@ _ties: dict[tuple[int, int], Ties] = {}
 
 def ties(data: int, flex: int) -> Ties:
   """Returns what holds the thread of a flex in an mjData."""
-  return _ties.setdefault((data, flex), Ties())
+  if (data, flex) not in _ties:
+    _ties[data, flex] = Ties()
+  return _ties[data, flex]
 
 
 def again(data: int, instance: int):

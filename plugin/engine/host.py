@@ -1,5 +1,6 @@
 """One organ in one mjData, as its passive forces and its coupling see it."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -34,11 +35,11 @@ class Host(host.Host):
       that a node in contact may have (1,)
     state: its numbers in mjData.plugin_state
     own: their blocks
-    weights: what contacts with it get weights by
+    lift: opens those of its contacts that are not to be
   """
 
   alone, nworld = True, 1
-  weights: Any = None
+  lift: Any = None
 
   def __init__(self, organ: Declaration, body: Body, data: int, model: int, instance: int):
     self.organ, self.config, self.body = organ, organ.config, body
@@ -116,7 +117,7 @@ class Host(host.Host):
 
   def open_contacts(self):
     """See `Host`."""
-    contacts.lift.launch("cpu", 1, 1, 0, self.weights)
+    self.lift.launch()
 
   def ties(self, flex: int) -> coupling.Ties:
     """See `Host`."""
@@ -178,6 +179,10 @@ class Host(host.Host):
   def launch(self, kernel: Twin, fields: Any, count: int = 0, arg: int = 0):
     """See `Host`."""
     kernel.one.launch(self.device, 1, 1, arg, fields)
+
+  def command(self, kernel: Twin, fields: Any, count: int = 0, arg: int = 0) -> Callable[[], None]:
+    """See `Host`."""
+    return kernel.one.command(fields, arg).launch
 
   # What there is now.
 

@@ -9,7 +9,7 @@ world.
 import abc
 import contextlib
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -220,6 +220,10 @@ class Host(abc.ABC):
       count: items that threads of a world share; 0 where one thread has a whole world
       arg: what to do
     """
+
+  def command(self, kernel: Twin, fields: Any, count: int = 0, arg: int = 0) -> Callable[[], None]:
+    """Returns what launches a kernel as `launch` does, as often as is wanted."""
+    return functools.partial(self.launch, kernel, fields, count, arg)
 
   def which(self, others: Sequence["Host"]) -> wp.array:
     """Returns which row of lists each world has that follow its mesh, and those of others."""

@@ -5,6 +5,7 @@ until that gives way, and leaves holes in it, through which it slides; see `forc
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -163,7 +164,7 @@ class Needles(Force):
     self.names: list[str] = []
     self._shape: dict[str, np.ndarray] = {}
     self._threads: list[dict] = []  # see `declare_needles.strand`
-    self._held: dict[int, Any] = {}  # `Held` of the needles that have one
+    self._feel: dict[int, Callable[[], None]] = {}  # takes the force of a needle's thread
     self._slit = np.zeros(0)  # width of what a tip opens [m]
     self._margin = np.zeros(0)  # see `PIERCE.margin` [m]
     self._before: dict[int, Mesh] = {}  # meshes of worlds that are being cut
@@ -294,25 +295,27 @@ class Needles(Force):
     frame = {"frame": thread["frame"], "origin": thread["origin"]}
     given = {"pierced": self.fields, "first": first, "span": ties.span}
     held = host.fill(Held, given | frame | ties.arrays)
-    self._held[k] = held
     host.load(_aim)
+    aim, lift, self._feel[k] = (
+      host.command(each, held, self.count, k) for each in (_aim, _lift, _feel)
+    )
 
-    def lift():
-      host.launch(_lift, held, self.count, k)
+    def lift_all():
+      lift()
       host.open_contacts()
 
-    ties.aims[host.instance, k] = (lambda: host.launch(_aim, held, self.count, k)), lift
+    ties.aims[host.instance, k] = aim, lift_all
 
   @property
   def sews(self) -> bool:
     """Whether it holds threads: these take their steps before the organ, which bears that."""
-    return bool(self._held)
+    return bool(self._feel)
 
   def lead(self):
     """Takes the forces of the threads' steps, which these take first."""
-    for k, held in self._held.items():
+    for k, feel in self._feel.items():
       self.host.ties(self._threads[k]["flex"]).lead(self.host.instance)
-      self.host.launch(_feel, held, self.count, k)
+      feel()
 
   def sew(self, name: str, x: np.ndarray):
     """Makes holes where a needle's thread goes through the surface, of one world.

@@ -80,13 +80,14 @@ class Kernel:
     dim = nworld, nthread
     wp.launch(self.on(device), dim=dim, inputs=inputs, device=device, block_dim=block_dim)
 
-  def command(self, fields) -> wp.Launch:
+  def command(self, fields, arg: int = 0) -> wp.Launch:
     """Returns what launches the kernel on the CPU, a thread over a world, as often as is wanted.
 
     Args:
       fields: the struct, read when it is launched
+      arg: what to do
     """
-    inputs = [1, 0, _reference(self.struct, fields)]
+    inputs = [1, arg, _reference(self.struct, fields)]
     return wp.launch(self.cpu, dim=(1, 1), inputs=inputs, device="cpu", record_cmd=True)
 
 
