@@ -23,7 +23,8 @@ NAMES: Mapping[tuple[int, ...], str] = {
   (2, -1, 1): "surgeon's 2-1-1",
 }
 _MOST = 40  # crossings of a projection that are looked at
-_TRIES = 24  # projections, of which that with the fewest crossings counts
+# Projections that are tried until one has few crossings; that with the fewest counts.
+_TRIES, _FEW = 24, 12
 
 Polynomial = dict[int, int]  # exponent -> coefficient, of A = t^(-1/4)
 
@@ -33,7 +34,8 @@ def closed(points: np.ndarray, axis: np.ndarray | None = None) -> np.ndarray:
 
   Args:
     points: nodes in their order [m]  (n, 3)
-    axis: how the ends are led away, as a vector from the first to the last; None for that
+    axis: along which the last end is led away, and the first one against it, not back through the
+      thread; None for the vector from the first to the last
 
   Returns:
     corners  (n + 3, 3)
@@ -89,6 +91,8 @@ def jones(polygon: np.ndarray) -> Polynomial | None:
     found = _diagram(np.asarray(polygon, dtype=float) @ frame)
     if best is None or len(found[0]) < len(best[0]):
       best = found
+    if len(best[0]) <= _FEW:
+      break
   assert best is not None
   crossings, writhe = best
   if len(crossings) > _MOST:
