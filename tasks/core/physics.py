@@ -9,6 +9,7 @@ import mujoco as mj
 import numpy as np
 import scipy
 from palpate import Organ, Thread
+from palpate.forces.needles import Needle
 from palpate.models import laparoscope
 from palpate.tissue.config import Config
 from palpate.tissue.geometry import mesh as topology
@@ -75,6 +76,7 @@ class Physics(Instrument, Portable):
     ]
     self.thread = Thread(model, self.data.ptr, threads[0]) if threads else None
     self._nodes: np.ndarray | None = None
+    self._needle: Needle | None = None
     self._points: dict[int, np.ndarray] = {}
     self._camera = model.camera(CAMERA).id
     self.target_sites = [model.site(f"target{i}").id for i in range(targets)]
@@ -150,8 +152,8 @@ class Physics(Instrument, Portable):
     self.moved()
 
   def moved(self) -> None:
-    """Forgets `nodes` and `point`: to be called when the state was changed from outside."""
-    self._nodes, self._points = None, {}
+    """Forgets what `nodes`, `point`, `needle` keep: for a state that is changed from outside."""
+    self._nodes, self._points, self._needle = None, {}, None
 
   def place(self, state: np.ndarray) -> None:
     """Puts the physics in an integration state, from which it goes on as it did before."""
@@ -194,6 +196,12 @@ class Physics(Instrument, Portable):
       nodes.flags.writeable = False
       self._nodes = nodes
     return self._nodes
+
+  def needle(self) -> Needle:
+    """Returns what the organ's one needle does; computed once a control step."""
+    if self._needle is None:
+      (self._needle,) = self.organ.needles
+    return self._needle
 
   def strain(self, rest: np.ndarray) -> Callable[[], float]:
     """Returns what works out the largest strain of the organ's surface as it is now [-].

@@ -272,19 +272,19 @@ def scraped(s: Any) -> float:
 
 def pierced(s: Any) -> tuple[int, float]:
   """Returns how many holes the needle has in the organ, and its pull on that [N]."""
-  (found,) = s.organ.needles
+  found = s.needle()
   return len(found.holes), length(found.force)
 
 
 def pinhole(s: Any, k: int) -> tuple[np.ndarray, float]:
   """Returns where one of these is at rest, and how far along the needle from its swage [m, m]."""
-  hole = s.organ.needles[0].holes[k]
+  hole = s.needle().holes[k]
   return hole.rest, float(hole.along)
 
 
 def torn_at(s: Any, k: int) -> float:
   """Returns how far one of these has torn through the tissue [m]."""
-  return float(s.organ.needles[0].holes[k].torn)
+  return float(s.needle().holes[k].torn)
 
 
 def taut(s: Any) -> float:

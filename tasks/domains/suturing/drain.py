@@ -241,5 +241,5 @@ class Sewn(Task):
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns gap, tension and the pull on the drain."""
-    pull = float(np.linalg.norm(physics.organ.needles[0].force))
+    pull = float(np.linalg.norm(physics.needle().force))
     return {"traction": pull, "gap": self.gap, "tension": self.tension}

@@ -493,13 +493,13 @@ class Running(Stitching):
 
   def _slack(self, physics: Any) -> float:
     """Returns how much longer the thread is from its first hole to the needle than the way [m]."""
-    holes = physics.organ.needles[0].holes
+    holes = physics.needle().holes
     way = np.array([*(hole.at for hole in holes), arc(physics, 0.0)])
     return -holes[0].along - _along(way) if holes else 0.0
 
   def _seam(self, physics: Any) -> float:
     """Returns how much longer the thread is than the way from its first hole to its last [m]."""
-    holes = physics.organ.needles[0].holes
+    holes = physics.needle().holes
     way = np.array([hole.at for hole in holes])
     return holes[-1].along - holes[0].along - _along(way) if holes else 0.0
 
