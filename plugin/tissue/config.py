@@ -110,15 +110,15 @@ class Config:
   strength: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
-    "tension at which an edge of a rod breaks, the one with the highest first; 0: none does; "
+    "tension at which an edge of a rod breaks, the one with the highest first; 0: none breaks; "
     'with `elements="rod"` alone',
     "N",
   )
   drag: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
-    "force of what a rod moves in, by length and velocity ([threads](physics.md#threads)); with "
-    '`elements="rod"` alone',
+    "drag of the medium on a rod, by length and velocity ([threads](physics.md#drag-and-damping)); "
+    'with `elements="rod"` alone',
     "N s/m²",
   )
   foundation: float = _row(
