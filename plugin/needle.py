@@ -59,14 +59,14 @@ def add_needle(
     diameter: [m]
     tip: `taper`, which tears a slit and spreads it, or `cutting`, with edges as wide as the needle;
       the size of the tip's site is half the slit's width
-    thread: a thread of the spec whose first node is at the swage, and stays there; the first
-      capsule, which it leaves from, then meets nothing
-    parent: what it is fixed in; None for the world, in which it is free
+    thread: a thread of the spec whose first node is at the swage, to which it is joined; the first
+      capsule then has no contacts
+    parent: body in which it is fixed; None for a free needle
     pos: of the circle's centre in the parent [m]
     quat: orientation in the parent
-    mass: [kg]; None for that of the wire in steel, 0.08 g as it is
+    mass: [kg]; None for that of the wire in steel, 0.08 g by default
     rgba: colour
-    contact: attributes of the geoms that are not as usual: condim, friction, contype, ...
+    contact: attributes of the geoms that differ from the defaults: condim, friction, contype, ...
 
   Returns:
     The body.
@@ -168,7 +168,7 @@ def _check_thread(spec, name: str, thread: str, swage: np.ndarray, length: float
   first, second = (spec.body(f"{thread}_{k}") for k in range(2))
   if first is None or spec.flex(thread) is None:
     raise ValueError(
-      f"needle {name!r}: thread is {thread!r}, expected one of the spec's whose first node moves"
+      f"needle {name!r}: thread is {thread!r}, expected one of the spec's whose first node is free"
     )
   at = _place(first.parent, first.pos, first.quat, np.zeros(3))
   if np.linalg.norm(at - swage) > _NEAR:

@@ -205,12 +205,12 @@ class Organ:
 
   @property
   def cutters(self) -> tuple[Cutter, ...]:
-    """What cuts it (key `cutters`): whether it is in the tissue, its force, energy and length."""
+    """The geoms of the key `cutters`: whether each is in the tissue, force, energy and length."""
     return tuple(self._space.cutters.read())
 
   @property
   def needles(self) -> tuple[Needle, ...]:
-    """What goes through it (key `needles`): whether it is in the tissue, its force and energy."""
+    """The needles of the key `needles`: whether each is in the tissue, its force and energy."""
     return tuple(self._space.needles.read(self._places()))
 
   def _places(self) -> np.ndarray:
@@ -218,23 +218,24 @@ class Organ:
     return self._organ.origin + (self._organ.mesh.rest + self._deformation) @ self._organ.frame.T
 
   def sew(self, needle: str):
-    """Takes a needle's thread as sewn: makes holes where it goes through the surface now.
+    """Sews a needle's thread: makes a hole wherever it crosses the surface now.
 
-    Lay the thread through it before, see `Thread.lay`. Holes that the needle had are forgotten.
+    Lay the thread through the organ before, see `Thread.lay`. Earlier holes of the needle are
+    removed.
 
     Args:
       needle: name of its body
 
     Raises:
-      ValueError: the organ does not know the needle, that has no thread, or the thread goes through
-        nowhere, or too often; the message says what is allowed.
+      ValueError: the key `needles` does not name the needle, it has no thread, or the thread
+        crosses the surface nowhere or too often; the message says what is allowed.
     """
     mujoco.mj_kinematics(self.model, self.data)
     self._space.needles.sew(needle, self._places())
 
   @property
   def pinholes(self) -> tuple[Pinhole, ...]:
-    """Where needles go through its surface, those of each in the order in which it made them."""
+    """The holes of needles in its surface, by needle, in the order in which they were made."""
     return tuple(hole for needle in self.needles for hole in needle.holes if not hole.inside)
 
   @property

@@ -38,8 +38,8 @@ def add_thread(
 ) -> mujoco.MjsFlex:
   """Adds a surgical thread to a spec, in a body of its name, as a <flexcomp> of dim 1 in MJCF.
 
-  It is straight where nothing acts, whatever line it starts on. An end is fixed to an instrument or
-  a needle by a <connect> of its node's body, `<name>_<k>`.
+  The thread is straight at rest, whatever line it starts on. A <connect> of a node's body,
+  `<name>_<k>`, fixes an end to an instrument or a needle.
 
   Args:
     spec: changed in place, unless an error is raised
@@ -47,15 +47,15 @@ def add_thread(
     name: of flex, body and plugin instance; the nodes' bodies are `<name>_<k>`
     material: `vicryl`, `silk` or `polypropylene`
     size: `3-0`, `4-0` or `5-0`
-    parent: what the body is in, which must not move; None for the world
+    parent: of the body, which must not move; None for the world
     pos: of the body in its parent [m]
     quat: orientation of the body in its parent
     pin: nodes that do not move; two next to each other hold the direction and turn of their edge
     rgba: colour
-    contact: attributes of <contact> that are not as usual
-    bead: radius of what is at its last node, such as a clip or a knot: it touches nothing, but does
-      not go through a needle's hole that is narrower; 0 for none [m]
-    **config: keys of a rod that are not the material's: young, poisson, bend, twist, strength,
+    contact: attributes of <contact> that differ from the defaults
+    bead: radius of a bead at the last node, such as a clip or a knot, which has no contacts but
+      does not pass a narrower hole of a needle; 0 for none [m]
+    **config: keys of a rod that replace the material's: young, poisson, bend, twist, strength,
       drag
 
   Returns:
@@ -101,7 +101,7 @@ def add_thread(
 
 
 def holds_of(model: mujoco.MjModel, body: np.ndarray) -> dict[str, int]:
-  """Returns the equalities by which bodies can hold a node, see `Thread.hold`, by name.
+  """Returns the equalities by which bodies can hold a node, by name, see `Thread.hold`.
 
   Args:
     model: compiled
@@ -115,16 +115,16 @@ def holds_of(model: mujoco.MjModel, body: np.ndarray) -> dict[str, int]:
 
 
 def no_hold(thread: str, name: str, holds: Mapping[str, int]) -> ValueError:
-  """Returns the error that says by what a thread can be held."""
+  """Returns the error that lists the equalities that can hold a thread."""
   have = ", ".join(map(repr, holds)) or "none"
   return ValueError(
-    f"thread {thread!r}: {name!r} does not hold it, expected a connect of a body and a node that "
-    f"is not active at first; the scene has {have}"
+    f"thread {thread!r}: {name!r} cannot hold it, expected a connect between a body and a node "
+    f"with active='false'; the scene has {have}"
   )
 
 
 class Thread:
-  """Places, tension and twist of a thread, in world coordinates and SI units.
+  """Positions, tension and twist of a thread, in world coordinates and SI units.
 
   Args:
     model: the compiled model
@@ -141,7 +141,7 @@ class Thread:
 
   @property
   def positions(self) -> np.ndarray:
-    """Places of the nodes [m], (nnode, 3)."""
+    """Positions of the nodes [m], (nnode, 3)."""
     organ = self._space.organ
     return organ.origin + self._local() @ organ.frame.T
 
@@ -153,24 +153,24 @@ class Thread:
     return out
 
   def lay(self, points: np.ndarray, nodes: Sequence[int] | None = None, tension: float = 0.0):
-    """Puts it, or a part of it, at rest along a line.
+    """Puts the thread, or a part of it, at rest along a line.
 
     Args:
-      points: of the line, from the first of the nodes on, in the world [m]; beyond it the thread
-        goes on straight                                               (n, 3)
-      nodes: that lie along it, from one of them to an end of the thread; what they leave stays
-        where it is. None for all, whose twist and breaks are forgotten then
-      tension: of its edges there [N]
+      points: of the line, from the first of the nodes on, in the world [m]; beyond them the
+        thread continues straight                                      (n, 3)
+      nodes: consecutive nodes along the line, up to an end of the thread; the others stay. None
+        for all nodes, which also resets twist and breaks
+      tension: of these edges [N]
 
     Raises:
-      ValueError: it has pinned nodes, or the nodes are not one after the other.
+      ValueError: the thread has pinned nodes, or the nodes are not consecutive.
     """
     organ, line = self._space.organ, np.asarray(points, dtype=float)
     if not organ.free.all():
-      raise ValueError(f"thread {self.name!r} has pinned nodes, expected one that is free")
+      raise ValueError(f"thread {self.name!r} has pinned nodes, expected one without")
     which = np.arange(len(organ.rest)) if nodes is None else np.asarray(nodes)
     if abs(np.diff(which)).max(initial=1) != 1 or abs(which[-1] - which[0]) != len(which) - 1:
-      raise ValueError(f"thread {self.name!r}: nodes is {nodes}, expected one after the other")
+      raise ValueError(f"thread {self.name!r}: nodes is {nodes}, expected consecutive ones")
     length = np.linalg.norm(np.diff(organ.rest[which], axis=0), axis=1)
     length += tension / self._space.constants["stretch"][np.minimum(which[1:], which[:-1])]
     last = line[-1] - line[-2]
@@ -191,17 +191,19 @@ class Thread:
 
   @functools.cached_property
   def holds(self) -> dict[str, int]:
-    """By what bodies can hold a node, see `hold`: numbers of equalities by name."""
+    """Equalities by which bodies can hold a node, see `hold`: numbers by name."""
     return holds_of(self.model, self._space.organ.body)
 
   def hold(self, by: str, node: int, anchor: Sequence[float] = (0, 0, 0), firm: bool = True):
-    """Lets a body hold a node, or none; near the node the thread does not meet that body.
+    """Lets a body hold a node, or release it.
+
+    Near the node the thread has no contacts with that body.
 
     Args:
-      by: name of a <connect> of the body and a node, whichever, that is not active at first
-      node: that is held from now on; -1 for none
-      anchor: where in the body [m]  (3,)
-      firm: whether the body bears on the node; otherwise the two just do not meet
+      by: name of a <connect> between the body and any node, with active="false" in MJCF
+      node: number of the node to hold; -1 releases
+      anchor: point of the body that holds it [m]  (3,)
+      firm: whether the equality carries force; without it only the contacts stay off
 
     Raises:
       ValueError: an argument is not allowed.
@@ -223,7 +225,7 @@ class Thread:
 
   @property
   def length(self) -> float:
-    """Length now [m]."""
+    """Present length [m]."""
     return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
   @property

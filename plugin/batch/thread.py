@@ -17,7 +17,7 @@ class Thread(abc.ABC):
   Attributes:
     name: name of the flexcomp
     nworld: number of worlds
-    holds: by what bodies can hold it, numbers of equalities by name
+    holds: equalities by which bodies can hold it, numbers by name
     space: its workspace in one mjData
   """
 
@@ -43,7 +43,7 @@ class Thread(abc.ABC):
 
   @abc.abstractmethod
   def lay(self, places: np.ndarray, mask=None):
-    """Puts the nodes of worlds at places, at rest; what they are twisted and broken by stays.
+    """Puts the nodes of worlds at positions, at rest; twist and breaks stay.
 
     Args:
       places: [m]  (nworld, nnode, 3)
@@ -51,18 +51,18 @@ class Thread(abc.ABC):
     """
 
   def hold(self, by: str, node, anchor, firm):
-    """Lets a body hold a node in each world, or none, see `palpate.Thread.hold`.
+    """Lets a body hold a node in each world, or release it, see `palpate.Thread.hold`.
 
-    Resets and states let go of them.
+    Resets and states release all.
 
     Args:
       by: name of the equality
-      node: that is held from now on, -1 for none  (nworld,)
-      anchor: where in the body [m]  (nworld, 3)
-      firm: whether the body bears on the node  (nworld,) of bool
+      node: number of the node to hold, -1 releases  (nworld,)
+      anchor: point of the body that holds it [m]  (nworld, 3)
+      firm: whether the equality carries force  (nworld,) of bool
 
     Raises:
-      ValueError: the scene has no such equality, or an array another shape.
+      ValueError: the scene has no such equality, or an array has a wrong shape.
     """
     if by not in self.holds:
       raise no_hold(self.name, by, self.holds)

@@ -26,7 +26,7 @@ from .workspace import Workspace
 
 if "register" in globals():
   raise ImportError(
-    f"{__name__} cannot be loaded again: MuJoCo calls what it loaded first; start Python anew"
+    f"{__name__} cannot be loaded again, because MuJoCo calls the first copy; restart Python"
   )
 
 _P = C.c_void_p

@@ -222,8 +222,8 @@ def read(model: int, instance: int) -> Declaration:
   edge = flexes.element_data(m, flex, 2)
   if len(rest) < 2 or not np.array_equal(edge, np.arange(len(rest) - 1)[:, None] + (0, 1)):
     raise ValueError(
-      f"thread {name!r}: its {len(edge)} edges are not one line through its {len(rest)} vertices "
-      "in their order, expected edges 0 1, 1 2, ... of two vertices or more"
+      f"thread {name!r}: its {len(edge)} edges do not join its {len(rest)} vertices in order, "
+      "expected edges 0 1, 1 2, ... of two vertices or more"
     )
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[flex])
   rod.check_edges(name, np.linalg.norm(np.diff(rest, axis=0), axis=1), radius)
@@ -304,8 +304,8 @@ def _check(m, flex: int, name: str):
   declare.check_flex(m, flex, name)
   if mjstruct.view(m.flex_selfcollide, m.nflex, np.int32)[flex]:
     raise ValueError(
-      f"thread {name!r}: selfcollide is set, expected 'none': a thread's contacts with itself are "
-      "not MuJoCo's"
+      f"thread {name!r}: selfcollide is set, expected 'none': the plugin handles a thread's "
+      "contacts with itself"
     )
 
 

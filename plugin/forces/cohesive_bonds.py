@@ -177,7 +177,7 @@ class Bonds(Force):
     twice = np.intersect1d(found["vert"], np.concatenate(bonded))
     if twice.size:
       raise ValueError(
-        f"organ {host.organ.name!r}: vertex {twice[0]} is bonded already, expected one bond a "
+        f"organ {host.organ.name!r}: vertex {twice[0]} is bonded already, expected one bond per "
         "vertex"
       )
     room = len(group.grip.vert) + host.organ.mesh.spare

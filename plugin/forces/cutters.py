@@ -306,13 +306,13 @@ def _find(host: Host, name: str, current: bool) -> int:
   geom = flexes.need(m, "geom", name, host.organ.name, "cutters")
   if not current and not host.organ.mesh.spare:
     raise ValueError(
-      f"organ {host.organ.name!r}: cutters names {name!r}, which cuts by its edge, allowed only "
+      f"organ {host.organ.name!r}: cutters names {name!r}, which cuts with its edge, allowed only "
       "with spare"
     )
   if not current and any(geom in flexes.meeting_geoms(m, int(f)) for f in flex):
     raise ValueError(
       f"organ {host.organ.name!r}: cutters names {name!r}, which collides with it, expected a "
-      "geom with contype='0' conaffinity='0': what cuts goes through"
+      "geom with contype='0' conaffinity='0', since cutters pass through the tissue"
     )
   return geom
 

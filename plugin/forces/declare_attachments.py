@@ -174,7 +174,7 @@ def _stiffness(host: Host, vert: np.ndarray, stiffness: float | None, most: floa
     raise ValueError(f"organ {name!r}: stiffness is {stiffness}, expected a number > 0 [N/m]")
   if stiffness > most:
     raise ValueError(
-      f"organ {name!r}: stiffness is {stiffness:g}, expected at most {most:.3g} N/m for a body that"
-      " is so light in a step of that length"
+      f"organ {name!r}: stiffness is {stiffness:g}, expected at most {most:.3g} N/m for a body "
+      "this light and this time step"
     )
   return stiffness * share

@@ -89,7 +89,7 @@ def to_body(
     raise ValueError(
       f"organ {host.organ.name!r}: bonds to {name!r} have a stiffness of "
       f"{law.stiffness * area.sum():.3g} N/m together, expected at most {limit:.3g} N/m for a body "
-      "that is so light in a step of that length"
+      "this light and this time step"
     )
   made = {"area": area, "anchor": local, "normal": normal}
   made["turn"] = np.tile(turn.T @ host.organ.frame, (len(vert), 1, 1))
@@ -104,7 +104,7 @@ def to_organ(
   assert isinstance(host, Host) and isinstance(there, Host)
   name, mesh = there.organ.name, there.organ.mesh
   if other is one:
-    raise ValueError(f"organ {name!r}: bonds name itself, expected a body or another organ")
+    raise ValueError(f"organ {name!r}: bonds name it too, expected a body or another organ")
   vert = _free(host) if near else check_vertices(host, vertices)
   theirs = there.places(np.arange(mesh.nouter), now)
   corner, no_geoms = theirs[mesh.elem], np.zeros((0, len(GEOM)))

@@ -44,14 +44,14 @@ def read(host: Host, name: str) -> dict[str, Any]:
   edge = organ.mesh.whole.edge_length
   if edge > circle:
     raise ValueError(
-      f"organ {organ.name!r}: its edges are {1e3 * edge:.3g} mm long in the mean, too long for a "
-      f"bite of needle {name!r}, expected at most its radius, {1e3 * circle:.3g} mm"
+      f"organ {organ.name!r}: its mean edge is {1e3 * edge:.3g} mm, too long for a bite of needle "
+      f"{name!r}, expected at most the radius of the needle's circle, {1e3 * circle:.3g} mm"
     )
   turn, origin = flexes.body_frame(m, body)
   angle = np.linspace(-half, half, 17)
   arc = origin + circle * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]) @ turn.T
   if _goes_through((arc - organ.origin) @ organ.frame, organ.mesh):
-    raise ValueError(f"organ {organ.name!r}: needle {name!r} begins in it, expected one outside")
+    raise ValueError(f"organ {organ.name!r}: needle {name!r} starts inside, expected outside")
   return {
     "body": body, "circle": circle, "half": half, "radius": float(size[:, 0].max()),
     "strand": strand(host, body),

@@ -102,15 +102,15 @@ _aim, _lift, _feel = kernels("forces/needles.h", Held, "aim_thread", "lift_threa
 
 @dataclasses.dataclass(frozen=True)
 class Pinhole:
-  """Where a needle goes through an organ's surface, or through a point inside of a solid.
+  """A hole of a needle or its thread, in an organ's surface or inside of a solid.
 
   Attributes:
     needle: name of its body
-    inside: whether it is a point inside of a solid
-    thread: whether it is the needle's thread that is in it
-    at: place now, in the world [m]                         (3,)
+    inside: whether it is inside of a solid
+    thread: whether the needle's thread is in it
+    at: present position, in the world [m]                  (3,)
     rest: the same at rest                                  (3,)
-    along: how far along the needle it is, from the swage; on the thread negative [m]
+    along: distance from the swage along the needle; on the thread negative [m]
     force: on the organ in the last step, in the world [N]  (3,)
     torn: how far it has torn through the tissue [m]
   """
@@ -127,16 +127,16 @@ class Pinhole:
 
 @dataclasses.dataclass(frozen=True)
 class Needle:
-  """A needle that an organ knows.
+  """A needle of an organ's key `needles`.
 
   Attributes:
     name: of its body
-    touches: whether its tip is pressed on a surface from either side
+    touches: whether its tip presses on a surface, from either side
     inside: whether its tip is in a solid
     force: of the whole needle on the organ in the last step, in the world [N]  (3,)
     tip_force: that of its tip                                                  (3,)
-    energy: that piercing and cutting have taken [J]
-    holes: its pinholes, the first made first
+    energy: dissipated by piercing and cutting [J]
+    holes: its holes, in the order in which they were made
   """
 
   name: str
@@ -330,11 +330,11 @@ class Needles(Force):
     """
     host, what = self.host, f"organ {self.host.organ.name!r}: needle {name!r}"
     if name not in self.names:
-      raise ValueError(f"{what} is none of its own, expected one of {', '.join(self.names)}")
+      raise ValueError(f"{what} is not in its needles, expected one of {', '.join(self.names)}")
     k = self.names.index(name)
     nodes = self._threads[k]["node"]
     if not len(nodes):
-      raise ValueError(f"{what} has no thread, expected one that `add_needle` has joined")
+      raise ValueError(f"{what} has no thread, expected one joined by `add_needle`")
     line = np.stack([host.body_frame(int(body))[1] for body in nodes])
     found = sorted(declare_needles.crossings(line, x[host.organ.mesh.elem]))
     # Through an edge or a corner it goes once.
@@ -343,8 +343,7 @@ class Needles(Force):
     ]
     if not 0 < len(rows) <= HOLES:
       raise ValueError(
-        f"{what} has a thread that goes through the surface {len(rows)} times, expected 1 to "
-        f"{HOLES}"
+        f"{what} has a thread that crosses the surface {len(rows)} times, expected 1 to {HOLES}"
       )
     length = self._threads[k]["edges"][:-1, 0]
     before = np.r_[0.0, np.cumsum(length)]

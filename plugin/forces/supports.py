@@ -265,8 +265,8 @@ def check(host: Host):
 def _warn_twice(organ: str, geom: str):
   """Warns once, not with each mjData."""
   mjstruct.warn(
-    f"organ {organ!r}: geom {geom!r} bears it by support and contact, so twice; give the geom "
-    "contype and conaffinity that do not meet the organ's"
+    f"organ {organ!r}: geom {geom!r} bears it by support and contact; give the geom contype "
+    "and conaffinity that exclude contacts with the organ"
   )
 
 

@@ -58,8 +58,8 @@ class Config:
   tetrahedra: str = _row(
     "",
     reading.PATH,
-    "Gmsh file, as text, whose tetrahedra a solid has inside: their nodes on the surface are its "
-    "vertices, in its frame [m]; none makes them",
+    "Gmsh file (text) with the tetrahedra of a solid: their nodes on the surface are its vertices, "
+    "in its frame [m]; left out, they are made",
   )
   young: tuple[float, ...] = _row(
     (5000.0,),
@@ -110,21 +110,21 @@ class Config:
   strength: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
-    "tension at which an edge of a rod breaks, the one with the highest first; 0: none does; "
+    "tension at which an edge of a rod breaks, the one with the highest first; 0: none breaks; "
     'with `elements="rod"` alone',
     "N",
   )
   drag: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
-    "force of what a rod moves in, by length and velocity ([threads](physics.md#threads)); with "
-    '`elements="rod"` alone',
+    "drag of the medium on a rod, by length and velocity ([threads](physics.md#drag-and-damping)); "
+    'with `elements="rod"` alone',
     "N s/m²",
   )
   foundation: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
-    "restoring force per area and displacement: stands for the interior and ligaments",
+    "restoring force per area and displacement: represents the interior and ligaments",
     "Pa/m",
     NUMBER,
   )
@@ -144,12 +144,12 @@ class Config:
   relax_share: float = _row(
     0.0,
     reading.number(0.0, 1.0),
-    "share of the elastic forces that fades while a strain is held; `young` is that at once",
+    "share of the elastic forces that relaxes under a constant strain; `young` is instantaneous",
     "-",
     NUMBER,
   )
   relax_time: float = _row(
-    0.5, reading.POSITIVE, "time constant of that, exp(-t / relax_time)", "s", NUMBER
+    0.5, reading.POSITIVE, "time constant of the relaxation, exp(-t / relax_time)", "s", NUMBER
   )
   integrator: str = _row(
     "implicit",
@@ -161,7 +161,7 @@ class Config:
   iterations: int = _row(
     200,
     reading.whole(1, 10000),
-    "most PCG iterations of a solve, or Newton iterations of a rod's step",
+    "limit of PCG iterations of a solve, or of Newton iterations of a rod's step",
     change=NUMBER,
   )
   tolerance: float = _row(
@@ -171,13 +171,13 @@ class Config:
   window: str = _row(
     "",
     (reading.name, "the name of a flexcomp"),
-    "flexcomp that follows the tools over the organ, which is rigid then (`add_windows` sets it); "
-    "none where the vertices are MuJoCo's dofs",
+    "flexcomp that follows the tools over the organ, which must be rigid (`add_windows` sets it); "
+    "left out, the vertices are MuJoCo's dofs",
   )
   follow: tuple[str, ...] = _row(
     (),
     (reading.names, "names of bodies"),
-    "bodies that the window follows; left out, all that moves and collides",
+    "bodies that the window follows; left out, all that move and collide",
   )
   mass: float = _row(0.0, reading.POSITIVE, "mass of the organ, with `window` alone", "kg")
   pin: tuple[int, ...] = _row(
@@ -186,8 +186,8 @@ class Config:
   carrier: str = _row(
     "",
     (reading.name, "the name of a body, or 'own'"),
-    "body that carries foundation and pins along ([attachments](authoring.md#attachments)); `own`: "
-    "the foundation goes with the organ's own rigid motion",
+    "body that carries foundation and pins ([attachments](authoring.md#attachments)); `own`: the "
+    "foundation follows the organ's own rigid motion",
   )
   attach: tuple[tuple[str, float, tuple[int, ...]], ...] = _row(
     (),
@@ -196,7 +196,7 @@ class Config:
       "a body or organ, a stiffness > 0 and vertices, a comma between such groups",
     ),
     "springs from vertices to a body, or to the nearest vertices of another organ: "
-    "`rib 500 3 17 18, stomach 200 40 41`; the stiffness is that of a group",
+    "`rib 500 3 17 18, stomach 200 40 41`; the stiffness is that of the whole group",
     "-, N/m, -",
   )
   bonds: tuple[BondRow, ...] | None = _row(
@@ -214,22 +214,22 @@ class Config:
   support: tuple[str, ...] = _row(
     (),
     (reading.names, "names of geoms and organs"),
-    "with `window` alone: geoms and organs that bear the organ, with friction, by springs of its "
-    "surface in place of MuJoCo's contacts ([lying](authoring.md#lying-on-something))",
+    "with `window` alone: geoms and organs that support the organ, with friction, by springs of "
+    "its surface in place of MuJoCo's contacts ([lying](authoring.md#lying-on-something))",
   )
   spare: int = _row(
     0,
     (reading.spare, "a whole number >= 0 or 'auto'"),
-    "vertices without triangles, after the others, that cuts make use of ([cutting](cutting.md)); "
+    "number of vertices without triangles, after the others, for cuts ([cutting](cutting.md)); "
     "`auto`: as many as there are; `add_organ` and `add_spare` make them",
   )
   walls: str = _row(
-    "", (reading.name, "the name of a flexcomp"), "drawn where a solid is cut (`add_organ`)"
+    "", (reading.name, "the name of a flexcomp"), "draws the walls of cuts (`add_organ` sets it)"
   )
   tear: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
-    "greatest principal strain, length over rest length less 1, beyond which tissue tears across "
+    "largest principal strain, length over rest length less 1, beyond which tissue tears across "
     "it, with `spare` ([cutting](cutting.md#tearing)); 0: never",
   )
   cutters: tuple[CutterRow, ...] = _row(
@@ -240,9 +240,9 @@ class Config:
       "comma between such groups",
     ),
     "geoms that cut the wall where they are driven through it (with `spare`), and the energy that "
-    "it takes to open an area, or that cut and free bonds by a current "
-    "([cutters](cutting.md#cutters)): `scalpel/edge 160, scissors/edge_left scissors/edge_right "
-    "160, hook/hook_toe 1.1e6 by current`",
+    "opens a unit area, or that cut and free bonds by a current ([cutters](cutting.md#cutters)): "
+    "`scalpel/edge 160, scissors/edge_left scissors/edge_right 160, hook/hook_toe 1.1e6 by "
+    "current`",
     "-, J/m²",
   )
   needles: tuple[NeedleRow, ...] = _row(
@@ -252,9 +252,9 @@ class Config:
       "a body, an energy > 0, and if wanted a friction >= 0 and an energy > 0 of the surface, a "
       "comma between such groups",
     ),
-    "needles (`add_needle`) that may go through the organ, the energy that it takes to open an "
-    "area, friction by length of needle in tissue, and the energy of a solid's surface where it "
-    "differs ([needles](authoring.md#needles)): `needle 800 15 1600`",
+    "needles (`add_needle`) that may pass through the organ, the energy that opens a unit area, "
+    "friction by length of needle in tissue, and the energy of a solid's surface if it differs "
+    "([needles](authoring.md#needles)): `needle 800 15 1600`",
     "-, J/m², N/m, J/m²",
   )
   resident: bool = _row(
@@ -266,13 +266,13 @@ class Config:
   subgrid: str = _row(
     "auto",
     reading.words("auto", "true", "false"),
-    "whether contacts of a tool that is small for the mesh yield by what the mesh cannot "
-    "([small tools](authoring.md#small-tools)); `auto`: those of bare solids",
+    "whether contacts of tools smaller than an edge get the compliance that the mesh lacks "
+    "([small tools](authoring.md#small-tools)); `auto`: on bare solids",
   )
   skin: str = _row(
     "",
     (reading.name, "the name of a skin"),
-    "drawn for the organ: its surface made smooth (`add_skin`)",
+    "draws the organ as a smooth surface (`add_skin` sets it)",
   )
   device: str = _row(
     "auto",

@@ -59,7 +59,7 @@ def numbers(text: str, nelem: int) -> tuple[float, ...]:
         raise ValueError(f"has {words[k]} for element {k}, expected numbers > 0")
       raise ValueError
   if len(values) not in (1, nelem):
-    raise ValueError(f"has {len(values)} values, expected 1 or {nelem} (one an element)")
+    raise ValueError(f"has {len(values)} values, expected 1 or {nelem} (one per element)")
   return values
 
 

@@ -45,8 +45,8 @@ def check_apart(name: str, x: np.ndarray, radius: float, between: float, core: f
   if far.min(initial=np.inf) <= core:
     k = int(far.argmin())
     raise ValueError(
-      f"thread {name!r}: edges {i[k]} and {j[k]} begin {1e3 * far[k]:.3g} mm from each other and "
-      f"radius is {1e3 * radius:.3g} mm, expected a thread that does not go through itself"
+      f"thread {name!r}: edges {i[k]} and {j[k]} start {1e3 * far[k]:.3g} mm from each other and "
+      f"radius is {1e3 * radius:.3g} mm, expected a thread that does not intersect itself"
     )
 
 

@@ -131,7 +131,7 @@ class Task(engine.Task):
     """Makes the exercise.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: a RandomState, a seed, or None for a seed of the system's
       force_limit: force above it is counted and costs [N]
       damage: the episode fails above it [N]

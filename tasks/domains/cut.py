@@ -301,7 +301,7 @@ class Cut(Task):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
       name: domain and task
       radius: of the line [m]

@@ -321,7 +321,7 @@ class Grasp(Hold):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
       lift: height to lift the site to [m]
       hold: how long to hold it there [s]

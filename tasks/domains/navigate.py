@@ -306,7 +306,7 @@ class Navigate(Task):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
       marks: how many to show
       centre: how far from the picture's middle, as a share of half its height

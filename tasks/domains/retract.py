@@ -151,7 +151,7 @@ class Retract(Hold):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
       radius: of the hidden disc [m]
       wanted: share of the disc that must be seen [-]

@@ -117,7 +117,7 @@ def stretched(
   """Returns a sheet in its frame, with instruments, light and what is around.
 
   Args:
-    scene: what it plays in
+    scene: of the exercise
     tissue: keys of the organ
     mass: of the sheet [kg]
     spare: room for a cut, times the square root of the nodes

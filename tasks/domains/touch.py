@@ -149,7 +149,7 @@ class Touch(Task):
     Args:
       points: how many to touch
       tolerance: largest distance from tip to point [m]
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
       **kwargs: see Task
     """

@@ -288,7 +288,7 @@ class Trace(Task):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
       size: half the width of the curve [m]
       turns: how often it waves; 0 is an arc

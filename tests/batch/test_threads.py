@@ -195,7 +195,7 @@ def test_what_cannot_hold_a_thread_is_named():
   for held, names in ((True, "none"), (False, "'grip'")):
     text = one.hand(held=held)
     worlds = palpate.batch.make(mujoco.MjSpec.from_string(text), 2, "cpu")
-    what = f"'nail' does not hold it, .*; the scene has {names}"
+    what = f"'nail' cannot hold it, .*; the scene has {names}"
     with pytest.raises(ValueError, match=what):
       worlds.thread("t").hold("nail", *given)
     with pytest.raises(ValueError, match=what):

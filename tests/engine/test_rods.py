@@ -258,7 +258,7 @@ def test_a_foreign_state_is_refused():
   [
     (dict(points=line(5, 3e-4)), r"edge \d is 0.075 mm long and radius is 0.1 mm"),
     (dict(points=[[0, 0, 0], [9e-3, 0, 0], [9e-3, 9e-3, 0], [5e-3, 9e-3, 0], [5e-3, -9e-3, 0]]),
-     "edges 0 and 3 begin 0 mm from each other and radius is 0.1 mm"),
+     "edges 0 and 3 start 0 mm from each other and radius is 0.1 mm"),
     (dict(points=line(5, 0.01), thickness=0.001), "thickness is set and elements is 'rod'"),
     (dict(points=line(5, 0.01), twist=-1), "thread 't': twist is '-1', expected a number >= 0"),
     (dict(points=line(5, 0.01), option='integrator="RK4"'), "RK4"),

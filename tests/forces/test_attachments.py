@@ -219,7 +219,7 @@ def test_a_copy_is_attached_too_and_a_reset_lets_go(make):
     (([3], 1.5), "no body 1.5"),
     (([3], None), "no body None"),
     (([3], "hook", -1.0), "stiffness is -1"),
-    (([3], "hook", 1e9), "expected at most .* N/m for a body that is so light"),
+    (([3], "hook", 1e9), "expected at most .* N/m for a body this light"),
   ],
 )
 def test_what_cannot_be_attached_is_named(make, arguments, message):

@@ -456,5 +456,5 @@ def test_a_declaration_that_cannot_be_is_named(make, keys, message):
 
 
 def test_springs_too_stiff_for_a_light_body_are_refused(make):
-  with pytest.raises(ValueError, match=r"expected at most .* N/m for a body that is so light"):
+  with pytest.raises(ValueError, match=r"expected at most .* N/m for a body this light"):
     make(LOOSE, bonds="hand 1e9 2e3 2 near 0.025")

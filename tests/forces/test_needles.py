@@ -414,11 +414,11 @@ def test_nothing_is_lost_in_violent_motion(free):
     ({"needles": "pin 100"}, "needles names 'pin', which is no body"),
     ({"needles": "needle"}, "needles is 'needle', expected a body, an energy > 0"),
     ({"needles": "needle -1"}, "expected a body, an energy > 0"),
-    ({"height": -0.003}, "needle 'needle' begins in it, expected one outside"),
-    ({"height": 0.005, "solid": True}, "needle 'needle' begins in it, expected one outside"),
+    ({"height": -0.003}, "needle 'needle' starts inside, expected outside"),
+    ({"height": 0.005, "solid": True}, "needle 'needle' starts inside, expected outside"),
     (
       {"mesh": sheet(4)[0], "pin": [0]},
-      "too long for a bite of .* at most its radius, 8.28 mm",
+      "too long for a bite of .* at most the radius of the needle's circle, 8.28 mm",
     ),
   ],
 )

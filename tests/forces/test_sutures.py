@@ -323,9 +323,9 @@ def test_a_thread_is_sewn_through_a_solid():
 
 def test_what_cannot_be_sewn_is_told():
   for nodes, name, message in (
-    (0, "pin", "needle 'pin' is none of its own, expected one of needle"),
-    (0, "needle", "has no thread, expected one that `add_needle` has joined"),
-    (8, "needle", "goes through the surface 0 times, expected 1"),
+    (0, "pin", "needle 'pin' is not in its needles, expected one of needle"),
+    (0, "needle", "has no thread, expected one joined by `add_needle`"),
+    (8, "needle", "crosses the surface 0 times, expected 1"),
   ):
     organ = load(scene(nodes=nodes))[2]
     with pytest.raises(ValueError, match=message):
@@ -335,7 +335,7 @@ def test_what_cannot_be_sewn_is_told():
   model = spec.compile()
   thread = palpate.Thread(model, mujoco.MjData(model), "thread")
   with pytest.raises(
-    ValueError, match="thread 'thread' has pinned nodes, expected one that is free"
+    ValueError, match="thread 'thread' has pinned nodes, expected one without"
   ):
     thread.lay([(0, 0, 0), (1, 0, 0)])
 

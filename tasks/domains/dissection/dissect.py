@@ -140,7 +140,7 @@ class Dissect(Freeing, Hold):
     """Makes the task.
 
     Args:
-      scene: what it plays in, with bonds
+      scene: of the exercise, with bonds
       random: see Task
       wanted: share of the bed that must come free cleanly [-]
       traction: limit of the pull on the liver [N]

@@ -99,7 +99,7 @@ class Freeing(Task):
     """Makes the task.
 
     Args:
-      scene: what it plays in, with bonds
+      scene: of the exercise, with bonds
       random: see Task
       wanted: share of their area that must come free as it should [-]
       traction: limit of the pull on what the organ is bonded to [N]

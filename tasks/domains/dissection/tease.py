@@ -145,7 +145,7 @@ class Tease(Freeing):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
       wanted: share of the strip that must come free cleanly [-]
       law: stiffness [N/m^3], strength [Pa] and energy [J/m^2] of what holds it

@@ -142,7 +142,7 @@ class Palpate(Task):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
       name: domain and task
       factor: stiffness of the inclusion over that of the organ [-]

@@ -223,7 +223,7 @@ class Press(Task):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
       sites: how many to press
       band: of force [N] or depth [m]

@@ -1,8 +1,8 @@
 """Drive: drive a needle through two marked points of a wall, in and out, with a wristed driver.
 
-A needle of 26 mm, half a circle, begins in the jaws. It is to go in through the first mark, under
-the wall along its own circle, and out through the second one, 12 mm on. The wall dents under the
-tip until it gives way, then the needle slides through its hole, see `palpate.add_organ(needles=)`.
+A needle of 26 mm, half a circle, starts in the jaws. It enters at the first mark, follows its own
+circle under the wall, and leaves at the second mark, 12 mm on. The wall dents under the tip until
+it is pierced; then the needle slides through its hole, see `palpate.add_organ(needles=)`.
 
 Own observations, in the world: `target` (3,), from the needle's tip to the mark whose turn it is
 [m]; `way` (3,), from the first mark to the second one [-]; `circle` (3,), axis of the needle's
@@ -186,11 +186,11 @@ class Drive(Stitching):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
-      tolerance: how far holes may be from their marks [m]
-      turn: most that the bite is turned about the vertical [deg]
-      tough: energy that it takes to open an area of the wall [J/m^2]
+      tolerance: largest distance of holes from their marks [m]
+      turn: largest rotation of the bite about the vertical [deg]
+      tough: energy that opens an area of the wall [J/m^2]
       **kwargs: see Task
     """
     self.tolerance, self.turn, self.tough = tolerance, math.radians(turn), tough

@@ -88,7 +88,7 @@ class Extracorporeal(drain.Sewn):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
       turns: how often the strands wind about each other in each throw, (1, 1) of a square knot,
         (2, 1, 1) of a surgeon's

@@ -1,4 +1,4 @@
-"""What exercises with a curved needle share: who holds it, and an expert's ways of moving it.
+"""Shared by exercises with a curved needle: which hand holds it, and an expert's motions.
 
 The needle is the one that `palpate.add_needle` makes by default, half a circle of 26 mm. Shares of
 it count from the swage, angles along its arc from the middle. It begins in the right hand's jaws.
@@ -151,7 +151,7 @@ class Needlework(Task):
   right_holds, left_holds = 1.0, 0.0  # as an episode begins
 
   def meet(self, spec: mujoco.MjSpec, bit: int = MEETS) -> None:
-    """Lets what has a bit meet what instruments meet the organ with, and solves its contacts."""
+    """Lets geoms with a contact bit touch instruments, and solves contacts of a light needle."""
     spec.option.tolerance = _SOLVED
     # By islands the Newton method of MuJoCo 4.0 leaves single steps unsolved, by up to 16 N.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
@@ -288,7 +288,7 @@ def apart(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def one(p: Performer, hand: Performer, script: Script) -> Script:
-  """Does the script of one of two hands while the other stays."""
+  """Runs the script of one of two hands while the other stays."""
   still: Iterator[np.ndarray] = iter(())
   yield from p.both(*((script, still) if hand is p else (still, script)))
 
@@ -321,9 +321,9 @@ def carry(
 
   Args:
     p: of the hand
-    path: returns the needle's pose at a share of the way, or its end alone
-    angle: that it turns by on the way [rad]; None to go to the end in a line
-    pushes: whether a teacher pushes on as hard as who had the hand before
+    path: returns the needle's pose at a share of the way, or at its end alone
+    angle: by which it turns on the way [rad]; None for a straight line to the end
+    pushes: whether a teacher keeps the push of the policy that had the hand before
   """
   (pos, mat), tip, turned = needle(p.physics), p.hand.tip_pos(), matrix(p.hand.tip_quat())
   if pushes and p.hasty:
@@ -481,7 +481,7 @@ def come(script: Script, there: Callable[[], bool]) -> Script:
 
 
 def over(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> bool:
-  """Returns whether a teacher's pose is in the cone over a goal that it comes down in."""
+  """Returns whether a teacher's pose is in the cone over a goal, in which it may descend."""
   off = pose[0] - goal[0]
   high = float(off @ up)
   aside = float(np.linalg.norm(off - high * up))
@@ -490,10 +490,10 @@ def over(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> bool:
 
 
 def height(p: Performer, pose: Pose, goal: Pose, up: np.ndarray) -> float:
-  """Returns how high over a goal a pose is put right [m].
+  """Returns the height over a goal at which a pose is corrected [m].
 
-  A teacher goes back no further than it must. Who learns from one that goes all of the way back, or
-  none of it, goes to and fro before the goal.
+  A teacher goes back no further than it must. A policy taught by one that always goes all of the
+  way back, or never, moves to and fro before the goal.
   """
   off = pose[0] - goal[0]
   aside = float(np.linalg.norm(off - (off @ up) * up))

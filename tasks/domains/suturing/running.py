@@ -1,8 +1,8 @@
 """Running: close a cut with a running suture of four stitches, with two wristed needle drivers.
 
-A stretched wall has a cut of 25 mm, which gapes by 2 mm: a flat one, or that of a stomach. Four
-stitches are to close it, 6 mm apart and 4 mm from its edges, with one thread of polypropylene 3-0
-that ends in a bead. Some of them are placed already, but loose. The right hand drives the needle
+A stretched wall, flat or that of a stomach, has a cut of 25 mm, which gapes by 2 mm. Four stitches
+close it, 6 mm apart and 4 mm from its edges, with one thread of polypropylene 3-0 that ends in a
+bead. Some of them are placed at the start, but loose. The right hand drives the needle
 through the two marks of a stitch, the left one takes its tip and draws needle and thread through.
 After the last one the thread is pulled until the gap is under a millimetre, and held so for half a
 second: no knot is tied.
@@ -11,8 +11,8 @@ The thread meets the wall in its holes alone, and it floats: there is no gravity
 cut do not touch each other.
 
 Own observations, in the world: `target` (3,), from the needle's tip to the mark whose turn it is
-[m]; `way` (3,), from the mark of the way in to that of the way out [-]; `circle` (3,), axis of the
-needle's circle [-]; `middle` (3,), from the mark of the way in to the middle of that circle [m];
+[m]; `way` (3,), from the entry mark to the exit mark [-]; `circle` (3,), axis of the needle's
+circle [-]; `middle` (3,), from the entry mark to the middle of that circle [m];
 `stitches` (1,), how many are placed; `pierced` (1,), holes of the next one that are made; `through`
 (1,), share of the needle that is through the last hole [-]; `gap` (1,), of the cut at its widest
 [m]; `tight` (1,), largest tension of the thread [N]; `right_holds` (1,), `left_holds` (1,), whether
@@ -297,11 +297,11 @@ class Running(Stitching):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
-      placed: stitches that are placed at the start, of four
-      tolerance: how far holes may be from their marks [m]
-      close: gap that is closed [m]
+      placed: number of the four stitches that are placed at the start
+      tolerance: largest distance of holes from their marks [m]
+      close: largest gap of a closed cut [m]
       tension: of the wall [N/m]
       over: organ and landmark whose wall it is, with its filling; None for a flat one
       **kwargs: see Task

@@ -242,10 +242,10 @@ class Stitch(Knot, Stitching):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
       turns: see `Knot`
-      tolerance: how far holes may be from their marks [m]
+      tolerance: largest distance of holes from their marks [m]
       **kwargs: see Task
     """
     self.tolerance = tolerance

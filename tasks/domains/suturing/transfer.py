@@ -243,11 +243,11 @@ class Transfer(Needlework):
     """Makes the task.
 
     Args:
-      scene: what it plays in
+      scene: of the exercise
       random: see Task
-      rings: how many
+      rings: number of rings
       size: their inner radius [m]
-      tilt: most that they are turned about the vertical [deg]
+      tilt: largest rotation of the rings about the vertical [deg]
       **kwargs: see Task
     """
     self.targets, self.size, self.tilt = rings, size, math.radians(tilt)

@@ -1,9 +1,9 @@
 """Contact forces without flicker: a probe pressed at 20 mm/s into the organs that ship.
 
-From the first touch on, but for 20 ms: the share of steps without a force between organ and probe,
-and the root mean square of the change from one step to the next, in percent of the mean force. What
-is asked for is less than 0.5 % and less than 5 %. The probe slides while it presses, for surfaces
-are not at right angles to it; why that matters: docs/physics.md, what MuJoCo sees.
+From 20 ms after the first touch on: the share of steps without a force between organ and probe, and
+the RMS change of the force from one step to the next, in percent of the mean force. The targets are
+less than 0.5 % and less than 5 %. The probe slides while it presses, since surfaces are not at
+right angles to it; docs/physics.md, "What MuJoCo sees", says why that matters.
 """
 
 from __future__ import annotations

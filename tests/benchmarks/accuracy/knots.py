@@ -1,12 +1,16 @@
 """Knots in threads: does anything go through, what holds, and what do edges cost?
 
-Random tangles are pulled tight by 0.5 N, and the Jones polynomial of the thread, closed far away,
-must be what it was; it is not decided where part of the thread came before a hand, or has too
-many crossings. Knots are drawn tight by 2 N at all four strands, the ends are let go, and the
-strands are pulled apart by up to 80 % of the thread's strength. An overhand knot is drawn tight by
-0.5 N with edges of 2 to 5 radii. The square knot of a stitch through a drain of 1000 nodes is drawn
-tight by 1 N, and timed while it is held so. Times are of `mj_step`, in CPU time, without the first
-20 steps, in which the thread, straight at rest, springs from the curve that it was drawn on.
+- Random tangles are pulled tight by 0.5 N. The Jones polynomial of the thread, closed far away,
+  must stay the same; it is undecided where part of the thread came before a hand, or has too many
+  crossings.
+- Knots are drawn tight by 2 N at all four strands, the ends are let go, and the strands are pulled
+  apart by up to 80 % of the thread's strength.
+- An overhand knot is drawn tight by 0.5 N with edges of 2 to 5 radii.
+- The square knot of a stitch through a drain of 1000 nodes is drawn tight by 1 N, and timed while
+  it is held so.
+
+Times are CPU times of `mj_step`, without the first 20 steps, in which the thread, straight at rest,
+springs from its initial curve.
 """
 
 from __future__ import annotations

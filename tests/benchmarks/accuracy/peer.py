@@ -6,14 +6,14 @@ same tetrahedra, or a limp skin without foundation and bending. The flex has
 `integrator="discrete"` and the CG solver, with every tolerance and number of iterations of
 `THEIRS`; ours has windows, and nodal coupling for skins.
 
-Times are those of a simulated second, in processor time of one thread, least of the repeats that
-take turns. Every side takes a block of steps in a row, so that it finds in the caches what it left
-there. Errors are those of the contact force on the instrument, RMS over its peak, against the same
-side at a quarter of the smallest step and a tolerance of 1e-6 (ours) or 1e-10 with right weights of
-the corners of touched triangles; a step's force is compared with that of its start and of its end,
-and the better one counts. That the flex's tetrahedra lock at nu = 0.45 is in both of its forces, so
-no part of its error. `--beside PYTHON` has the flex of another MuJoCo, of that interpreter's
-packages, take its blocks of steps in turn with the others, against its own smallest steps.
+Times are processor times of one thread for a simulated second, the least of several repeats. All
+sides take blocks of steps in turn; a block keeps the caches warm. Errors are RMS errors of the
+contact force on the instrument, over its peak, against the same side at a quarter of the smallest
+step and a tolerance of 1e-6 (ours) or 1e-10 (flex, with right weights of the corners of touched
+triangles). A step's force is compared with the reference at its start and at its end, and the
+better one counts. The flex's tetrahedra lock at nu = 0.45 in both of its forces, so this is no part
+of its error. `--beside PYTHON` adds the flex of another MuJoCo, from that interpreter's packages,
+against its own smallest steps.
 """
 
 from __future__ import annotations

@@ -1,21 +1,23 @@
 """Forces of tissue against closed forms, another library's finite elements, and measurements.
 
-Ours over the reference, case by case, with the error in percent. A sphere presses a solid block
-without friction, as `palpate fit` simulates it; its references are Hertz's half space with the
-correction for a layer that is bonded at its bottom (Dimitriadis et al. 2002,
-doi:10.1016/S0006-3495(02)75620-8, eq. 14) and fine quadratic finite elements of scikit-fem of small
-strains. `edges` is the number of triangles' edges in the contact's radius. Closed forms of a bar
-and of Lame's hollow sphere follow, and a clamped beam by scikit-fem: the clamp hinders its sides,
-by which it sags 2 to 8 % less than Timoshenko's. Then organs under the shipped 5 mm probe, whose
-end and the surface, 1 mm thick, meet as a sphere of 3.5 mm: the reference is a solid of the
-measured modulus with edges of 1.5 mm under such a sphere, as deep from the first touch on, by the
-rows above within some 5 % itself; beside it solids, and the shipped skins, whose foundation stands
-for their inside. `mesh`: those skins with fewer triangles, even ones and with `fine` ones where the
-probe goes, over 16,000 nodes, with contacts as firm as those of `fine`; and as they ship, with
-`subgrid="true"`. `small`: a ball on a block, over Hertz's layer, and on a skin with a foundation
-and `subgrid="true"`, over the closed form of a plate on one (`reference/plates.py`), on a node and
-between nodes; and its greatest force over the least where it slides on over an edge, as deep and
-without friction.
+Each row is our force over the reference, with the error in percent.
+
+- A sphere presses a solid block without friction, as `palpate fit` simulates it. The references are
+  Hertz's half space with the correction for a layer that is bonded at its bottom (Dimitriadis et
+  al. 2002, doi:10.1016/S0006-3495(02)75620-8, eq. 14) and fine quadratic finite elements of
+  scikit-fem at small strains. `edges` is the radius of the contact in edges of triangles.
+- Closed forms of a bar and of Lame's hollow sphere, and a clamped beam by scikit-fem. The clamp
+  hinders the beam's sides, by which it sags 2 to 8 % less than Timoshenko's.
+- Organs, solids and shipped skins, under the shipped 5 mm probe, whose end and the surface, 1 mm
+  thick, meet as a sphere of 3.5 mm. The reference is a solid of the measured modulus with edges of
+  1.5 mm under such a sphere, equally deep from the first touch; by the rows above it is right
+  within some 5 %.
+- `mesh`: the shipped skins with fewer triangles, even or `fine` under the probe, over 16,000 nodes,
+  with contacts as firm as those of `fine`; and as they ship, with `subgrid="true"`.
+- `small`: a ball on a block, over Hertz's layer, and on a skin with a foundation and
+  `subgrid="true"`, over the closed form of a plate on a foundation (`reference/plates.py`), on a
+  node and between nodes. The last rows are its largest force over the smallest while it slides over
+  an edge, equally deep and without friction.
 """
 
 from __future__ import annotations

@@ -1,15 +1,17 @@
 """How punctual a live loop is while a page shows it, how late pictures are, what the loop costs.
 
-`exercise`, `practice` and `small` go through the page of a headless Chromium; a script in the page
-moves the mouse. The processor draws there, not a graphics card, and as many pictures as it can:
-`small` is the exercise in a window whose picture it draws in no time, and shows whether anything
-else holds pictures back. `script` is the time of all JavaScript for each picture. `hand` is the
-exercise with a simulated hand and no page. A step is on time when it has ended before the next one
-is due. From hand to picture: from the mouse's event until the page has handed over the first
-picture that has it; drawing it, and a screen, add their own time. `beside` is the processor's time
-of a step of the loop less that of its physics alone, `mesh` the steps a second that free practice
-reaches on one core, in its own processor time. The load is that of the minute before: on a machine
-with nothing else to do it is what this bench itself makes.
+- `exercise`, `practice` and `small` go through the page in a headless Chromium; a script there
+  moves the mouse. The processor draws, not a graphics card, as many pictures as it can. `small` is
+  the exercise in a window that is quickly drawn, and shows whether anything else delays pictures.
+- `hand` is the exercise with a simulated hand and no page.
+- `mesh` is the number of steps a second that free practice reaches on one core, in its own
+  processor time.
+
+A step is on time when it has ended before the next one is due. The delay from hand to picture ends
+when the page has handed over the first picture that shows the mouse's event; drawing it, and a
+screen, add their own time. `script` is the time of all JavaScript for each picture. `beside` is the
+processor time of a step of the loop less that of its physics alone. The load is that of the minute
+before: on an idle machine it is what this bench itself makes.
 """
 
 from __future__ import annotations
