@@ -334,10 +334,8 @@ def finding(rows: list[Row]) -> list[str]:
   ]
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
-  rows = [row for row in rows if row["status"] == "ok"]
-
   def number(row: Row, key: str) -> str:
     value = float(row[key])
     return f"{value:.2f}" if math.isfinite(value) else "-"
@@ -368,17 +366,17 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   lines += [
     f"Of {tried} policies {bad[1]} succeeded without the work, and {bad[0]} failures had a score. "
     "What is paid without success must be less than what is paid with it. "
-    + results.link(out / "loopholes.csv"),
+    + results.link(path),
     "",
   ]
   lines += plots.table(head, table)
   tasks = list(dict.fromkeys(row["task"] for row in rows))
   title = "Loopholes of the exercises"
-  picture = plots.bars(out / "loopholes.png", "What a search was paid", tasks, {
+  picture = plots.bars(path.with_suffix(".png"), "What a search was paid", tasks, {
     "most paid without success": [_extreme(rows, task, limits[0], max) for task in tasks],
     "least paid with success": [_extreme(rows, task, limits[1], min) for task in tasks],
   }, "return")  # fmt: skip
-  return [picture, results.page(out / "loopholes.md", title, about, lines, finding(rows), picture)]
+  return results.Page(title, finding(rows), lines, [picture])
 
 
 BENCH = Bench("loopholes", stages, run, report=report, arguments=arguments, jobs=2, limit=3600.0)

@@ -68,7 +68,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return rows
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page: what each metric tells apart, and the effect sizes task by task."""
   head = [
     "Cells are Cohen's d, positive where the novice is worse; `inf` where neither group varies. "
@@ -83,8 +83,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   for task in dict.fromkeys(row["task"] for row in rows):
     lines += _task(task, [row for row in rows if row["task"] == task], told)
   lines = [*head, "", "## Metric by metric", "", *_verdicts(told), *lines]
-  title = "Metrics: expert against novices"
-  return [results.page(out / "skill.md", title, about, lines, finding(told))]
+  return results.Page("Metrics: expert against novices", finding(told), lines)
 
 
 def finding(told: dict[tuple[str, str], dict[str, float]]) -> list[str]:

@@ -487,14 +487,12 @@ def finding(rows: list[Row]) -> list[str]:
   return lines
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Draws the figures and writes the page, of all devices that there are results of."""
+  out, title = path.parent, "The tables of the thesis, measured today"
   rows = [r for path in sorted(out.glob("thesis_c*.csv")) for r in results.read(path)
           if r["status"] == "ok"]  # fmt: skip
-  drawn = draw(rows, out)
-  page = results.page(out / "thesis.md", "The tables of the thesis, measured today", about,
-                      summarize(rows, conditions(out)), finding(rows), drawn[0])  # fmt: skip
-  return [*drawn, page]
+  return results.Page(title, finding(rows), summarize(rows, conditions(out)), draw(rows, out))
 
 
 BENCH = Bench(
