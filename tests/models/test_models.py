@@ -123,7 +123,7 @@ def test_exercises_have_a_tissue_of_their_own_that_says_so():
     assert config.young == (tissue.young,) and config.foundation == tissue.foundation
 
 
-@pytest.mark.parametrize("nodes", models.RESOLUTIONS[:3])
+@pytest.mark.parametrize("nodes", [250, 1000, pytest.param(4000, marks=pytest.mark.slow)])
 def test_resolution(nodes):
   model = models.load("kidney", nodes, instruments=()).compile()
   organ = palpate.Organ(model, mujoco.MjData(model), "kidney/kidney")
@@ -159,10 +159,9 @@ def test_what_cannot_be_solid_says_why():
     models.load("stomach", 250, interior="solid")
 
 
-@pytest.mark.parametrize("side", [16, 32])
+@pytest.mark.parametrize("side", [16, pytest.param(32, marks=pytest.mark.slow)])
 def test_grid(side):
-  spec = models.organ("gallbladder", grid=side)
-  model = spec.compile()
+  model = models.organ("gallbladder", grid=side).compile()
   assert model.nflexvert == side * side + 2
   assert palpate.Organ(model, mujoco.MjData(model), "gallbladder").volume > 0
 
