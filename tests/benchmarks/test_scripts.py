@@ -101,10 +101,3 @@ def test_peer_is_beside_ours(tmp_path):
       assert flex["error"] > 1.5 * right["error"] > 0
   page = (tmp_path / "peer.md").read_text()
   assert "times ours" in page and "A step of 1 ms" in page
-
-
-@pytest.mark.slow
-def test_a_sleeping_organ_is_timed(tmp_path):
-  assert command("rest", "--short", "-o", tmp_path) == 0
-  rows = results.read(tmp_path / "rest_cpu.csv")
-  assert all(row["asleep_us"] < row["awake_us"] for row in rows)

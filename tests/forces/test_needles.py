@@ -154,7 +154,7 @@ def test_both_layers_of_a_wall_are_pierced_by_their_own_toughness(free):
   model, data, organ = load(wall(free=free))
   lower = palpate.Organ(model, data, "lower")
   layers, seen, energy, holes = (organ, lower), [], [], []
-  for angle in np.arange(0.0, 3.4, 2e-3):
+  for angle in np.arange(0.0, 3.4, 3e-3):
     data.ctrl[0] = angle
     mujoco.mj_step(model, data)
     along = data.site("needle_tip").xmat.reshape(3, 3)[:, 2]
