@@ -155,7 +155,7 @@ def cover(spec: mujoco.MjSpec, organ: str, kind: str, look: int = 0, uv=None) ->
   return skins.add_skin(spec, organ, material=material, texcoord=uv)
 
 
-def dress(spec: mujoco.MjSpec, organ: str, kind: str, uv: np.ndarray, look: int = 0):
+def dress(spec: mujoco.MjSpec, organ: str, kind: str, uv: np.ndarray):
   """Gives an organ's own surface the look of a kind; an open one, since skins have one side.
 
   Args:
@@ -163,10 +163,9 @@ def dress(spec: mujoco.MjSpec, organ: str, kind: str, uv: np.ndarray, look: int 
     organ: name of the flexcomp
     kind: of COLOURS
     uv: texture coordinates of its vertices  (n, 2)
-    look: seed of spots and vessels
   """
   flex = spec.flex(organ)
-  flex.material = _material(spec, organ, COLOURS[kind], kind, look)  # its colour is its own
+  flex.material = _material(spec, organ, COLOURS[kind], kind, look=0)  # its colour is its own
   flex.rgba = [0.5, 0.5, 0.5, 1.0]
   flex.texcoord, flex.elemtexcoord = np.ravel(uv), flex.elem
 

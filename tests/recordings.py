@@ -11,6 +11,12 @@ SETTINGS = Settings(
   tip_cutoff=None,
   movement_cutoff=25.0,  # half the rate of the recordings below: nothing is cut
 )
+# Columns that are drawn, and up to what.
+DRAWN = {"strain": 1, "traction": 1, "deviation": 1e-3, "farthest": 1e-3, "excess": 1e-5}
+DRAWN |= {"jagged": 1e-2, "depth": 1e-2} | dict.fromkeys((
+  "current", "idle_current", "regrasped", "ring_time", "bite", "ring_force", "gap", "tension",
+  "security", "torn",
+), 1)  # fmt: skip
 
 
 def exercise(steps=300, instruments=("left", "right"), seed=0, journal=None):
@@ -33,25 +39,9 @@ def exercise(steps=300, instruments=("left", "right"), seed=0, journal=None):
       grip_force=np.maximum(0, rng.randn(len(instruments))),
       shaft_force=np.maximum(0, rng.randn(len(instruments))),
       surroundings_force=np.maximum(0, rng.randn(len(instruments))),
-      strain=rng.rand(len(instruments)),
       area=np.full(len(instruments), 2e-5),
       freed=np.full(len(instruments), k / steps),
-      traction=rng.rand(len(instruments)),
-      deviation=rng.rand(len(instruments)) * 1e-3,
-      farthest=rng.rand(len(instruments)) * 1e-3,
-      excess=rng.rand(len(instruments)) * 1e-5,
-      jagged=rng.rand(len(instruments)) * 1e-2,
-      depth=rng.rand(len(instruments)) * 1e-2,
-      current=rng.rand(len(instruments)),
-      idle_current=rng.rand(len(instruments)),
-      regrasped=rng.rand(len(instruments)),
-      ring_time=rng.rand(len(instruments)),
-      bite=rng.rand(len(instruments)),
-      ring_force=rng.rand(len(instruments)),
-      gap=rng.rand(len(instruments)),
-      tension=rng.rand(len(instruments)),
-      security=rng.rand(len(instruments)),
-      torn=rng.rand(len(instruments)),
+      **{name: rng.rand(len(instruments)) * size for name, size in DRAWN.items()},
       grip=np.full(len(instruments), k % 100 < 60),
       held=np.full(len(instruments), 10 < k % 100 < 40),
       visible=rng.rand(len(instruments)) > 0.1,

@@ -162,7 +162,7 @@ class Episodes:
       frame |= {f"drawn_{k}": np.array(v) for k, v in self._task.drawn.items()}
     mj.mj_camlight(model, self.physics.data.ptr)
     frame["eye"] = self.physics.camera()[0]
-    frame["reference"] = np.array(self._task.reference_length() or 0.0)
+    frame["reference"] = np.array(self._task.reference_length or 0.0)
     task = self._task
     frame |= dict(self._draw_own(task)) | dict(task.tissue())
     put = task.joints | task.bodies | task.threads

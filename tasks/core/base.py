@@ -86,6 +86,7 @@ class Task(engine.Task):
     shaping: see the module's head [-]
     best: best progress so far [-]
     cost: of the last control step, see `safety`
+    reference_length: of the path that the exercise asks for [m], None for none
     joints: positions that an episode begins with, by joint, beside the instruments'
     bodies: places and orientations that it begins with, by body without joints  (7,)
     threads: places of the nodes that it begins with, by thread  (nnode, 3)
@@ -98,6 +99,7 @@ class Task(engine.Task):
   settles = stage.SETTLES  # see `stage.build` [s]
   slots = 12  # nodes that the instrument touches at once, and some more: slots of a GPU's window
   watch = ("miss", "unintended_contact")
+  reference_length: float | None = None
   final: tuple[str, ...] = ()  # components that end the episode above 0.5
   control_timestep = CONTROL_TIMESTEP
   outcome: str | None = None
@@ -320,7 +322,8 @@ class Task(engine.Task):
 
   def recorded(self, physics: Physics) -> Mapping[str, Any]:
     """Returns further columns of a sample, see `Recorder.append`."""
-    return {}
+    columns = self.rules.columns if self.rules else {}
+    return {name: float(getattr(self, field)) for name, field in columns.items()}
 
   def arrays(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns the arrays of a control step: action, what hands felt, where a laparoscope went."""
@@ -336,10 +339,6 @@ class Task(engine.Task):
   def constants(self, physics: Physics) -> Mapping[str, np.ndarray]:
     """Returns further constants of a recording, see `Recorder.attach`."""
     return {}
-
-  def reference_length(self) -> float | None:
-    """Returns the length of the path that the exercise asks for [m]."""
-    return None
 
   def expert(self, p: Any) -> Iterator[np.ndarray]:
     """Yields the actions of an expert, in the words of `performer.Performer`."""
@@ -485,7 +484,7 @@ class Task(engine.Task):
       force_limit=self.force_limit,
       grip_limit=self.force_limit if self.grips else None,
       tip_cutoff=None,  # the simulation's positions are exact
-      reference_length=self.reference_length(),
+      reference_length=self.reference_length,
       contact_force=0.02,
       local_axis=(0.0, 0.0, -1.0),
     )

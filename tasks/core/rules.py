@@ -50,6 +50,7 @@ class Rules:
     observe: rule (s, o) that returns o with its own observations up to date
     observed: fields of the state that are these
     metrics: of the domain's own, by the field that is an episode's value so far
+    columns: of a recording, by the field that is their value, see `Recorder.append`
     begin: rule (s, o) that returns o as an episode begins and the physics can be asked, or None
     act: rule (s, o) that returns o once an action has moved the drives, before the physics, or None
     shared: arrays of the state that are the same in all worlds and episodes
@@ -64,6 +65,7 @@ class Rules:
   observe: Callable
   observed: tuple[str, ...]
   metrics: Mapping[str, str] = dataclasses.field(default_factory=dict)
+  columns: Mapping[str, str] = dataclasses.field(default_factory=dict)
   _: dataclasses.KW_ONLY
   begin: Callable | None = None
   act: Callable | None = None
@@ -87,7 +89,7 @@ class Rules:
         raise TypeError(
           f"{where}: {name!r} is {kind!r}, expected int, float, bool, Vector, Vectors3 or an array"
         )
-    for name in (*self.observed, *self.metrics.values(), *self.shared):
+    for name in (*self.observed, *self.metrics.values(), *self.columns.values(), *self.shared):
       if name not in known:
         raise TypeError(f"{where}: {name!r} is no field, expected one of {', '.join(known)}")
     for name in (*self.observed, *self.metrics.values()):
@@ -472,6 +474,13 @@ def tear(s: Any, o: Any, value: float) -> None:
 
 
 # Formulas.
+
+
+def shown(k: int, done: int) -> int:
+  """Returns the look of mark k where it is the turn of that after so many."""
+  if k == done:
+    return NOW
+  return LATER if k > done else HIDDEN
 
 
 def closeness(distance: float, start: float) -> float:

@@ -270,6 +270,7 @@ class Cut(Task):
 
   watch = ("miss", "unintended_contact")
   mark_radius = 0.0009
+  targets = MARKS
   rules = Rules(
     State,
     advance,
@@ -282,6 +283,14 @@ class Cut(Task):
       "cut_jagged": "jagged",
       "cut_depth": "deepest",
       "peak_traction": "pulled",
+    },
+    {
+      "deviation": "mean",
+      "farthest": "farthest",
+      "excess": "excess",
+      "jagged": "jagged",
+      "depth": "deepest",
+      "traction": "traction",
     },
     mark=mark,
   )
@@ -310,7 +319,6 @@ class Cut(Task):
       traction: limit of the pull along the sheet [N]
       **kwargs: see Task
     """
-    self.targets = MARKS
     if not 0.005 <= radius * (1 + abs(wave)) <= 0.024:
       raise ValueError(
         f"{name}: radius is {radius} and wave {wave}, expected a line from 5 to 24 mm of the middle"
@@ -322,7 +330,7 @@ class Cut(Task):
     self.radius, self.wave, self.tolerance, self.limit = radius, wave, tolerance, traction
     self.room = len(line(radius, wave, 0.0)[0]) + 4  # another may have a point or two more
     kwargs = {"force_limit": 0.8, "damage": 2.0, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=MARKS), random, name=name, **kwargs)
+    super().__init__(scene, random, name=name, **kwargs)
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene, which has no other shapes."""
@@ -341,6 +349,7 @@ class Cut(Task):
     self.inside, self.travelled, self.seat = cutter(physics)
     self.done, self.next, self.covered, self.nearest = 0, 0, 0.0, 0.0
     self.distance0 = distance(physics, self)
+    self.reference_length = self.length + self.distance0
 
   def label(self, kind: str) -> str:
     """Returns what damage is."""
@@ -356,20 +365,9 @@ class Cut(Task):
       return "Push the tip of the blade through the line"
     return f"Cut along the line: {100 * self.covered:.0f} % done"
 
-  def recorded(self, physics: Physics) -> dict[str, float]:
-    """Returns how the cut is so far."""
-    own = {"deviation": self.mean, "farthest": self.farthest}
-    own |= {"excess": self.excess, "jagged": self.jagged, "depth": self.deepest}
-    own |= {"traction": self.traction}
-    return dict(super().recorded(physics)) | own
-
   def constants(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns the line to cut [m]."""
     return {"line": self.curve}
-
-  def reference_length(self) -> float:
-    """Returns the length of the line and of the way to it [m]."""
-    return self.length + self.distance0
 
   def _goes_on(self, physics: Physics) -> bool:
     """Returns whether somebody else was cutting along the line."""

@@ -78,6 +78,7 @@ LOW, RESTING, LETTING = -0.25, 0.4, 0.5
 READY = 0.24  # shaping of jaws that are closed on the site, less than that of any grasp [-]
 TIGHT, HIGH = -0.03, -0.02  # shaping of a fold that was held long enough, and of a lift then [-]
 LOOSE = 0.045  # what it gains at rest in jaws without force [-]
+GRIPS = {"grip": "closing", "held": "grasped"}  # see `Rules.columns`
 
 
 @exercise("grasp/easy", 20, "easy")
@@ -201,10 +202,6 @@ class Hold(Task):
     """Returns what a miss is, and how tissue was lost."""
     return "closed off the site" if kind == "miss" else "slipped" if self.closing else "let go"
 
-  def recorded(self, physics: Physics) -> dict[str, float]:
-    """Returns whether the jaws are told to close and whether they hold."""
-    return {"grip": float(self.closing), "held": float(self.grasped)}
-
 
 class State(Held):
   """State of a world."""
@@ -314,8 +311,9 @@ class Grasp(Hold):
   """Grasp, lift, hold, lower, release."""
 
   rules = Rules(
-    State, advance, observe, ("target", "height", "held", "grasped"), shaping=shaping, mark=mark
-  )
+    State, advance, observe, ("target", "height", "held", "grasped"), columns=GRIPS,
+    shaping=shaping, mark=mark,
+  )  # fmt: skip
 
   def __init__(self, scene: Scene, random=None, *, lift: float, hold: float, **kwargs):
     """Makes the task.
@@ -327,16 +325,17 @@ class Grasp(Hold):
       hold: how long to hold it there [s]
       **kwargs: see Task; the force limit counts the jaws too
     """
-    self.targets, self.lift, self.hold = 1, lift, hold
+    self.lift, self.hold = lift, hold
     self.slip = 0.5 * lift
     kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
+    super().__init__(scene, random, **kwargs)
 
   def begin(self, physics: Physics) -> None:
     """Draws the site."""
     super().begin(physics)
     self.rest = physics.point(self.site)
     self.up = physics.trocar().mat[:, 2]
+    self.reference_length = self.distance0 + 2 * self.lift  # up and down again
     again(self)
 
   @property
@@ -355,10 +354,6 @@ class Grasp(Hold):
     if raised(physics, self) < self.lift:
       return f"Lift it by {1e3 * self.lift:.0f} mm, towards the trocar"
     return f"Hold it there for {max(self.hold - self.time, 0.0):.1f} s more"
-
-  def reference_length(self) -> float:
-    """Returns the way to the site, up and down again [m]."""
-    return self.distance0 + 2 * self.lift
 
   def expert(self, p: Performer) -> Script:
     """Grasps, lifts, holds, lowers and lets go."""

@@ -19,7 +19,6 @@ limit, or the time limit.
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -30,9 +29,6 @@ from palpate.tissue.types import Array, ints
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
 from ..core.rules import (
-  HIDDEN,
-  LATER,
-  NOW,
   RUNNING,
   SUCCESS,
   Rules,
@@ -49,6 +45,7 @@ from ..core.rules import (
   picture,
   point,
   root,
+  shown,
   sine,
   vector,
 )
@@ -215,8 +212,7 @@ def advance(s, o):
   side = in_picture(s, o.sides[now(o)])
   far = length(v)
   near = o.low <= far and far <= o.high and short(o, v, side) == 0.0
-  shown = o.centred and near and abs(o.horizon) <= o.tilt
-  if shown:
+  if o.centred and near and abs(o.horizon) <= o.tilt:
     o.time = o.time + o.control_timestep
   elif not follows(o):
     o.time = 0.0
@@ -267,11 +263,10 @@ def observe(s, o):
 def mark(s, o, k):
   """Marks what is left, and the ends of the pins."""
   of = k // o.per
-  look = LATER if of > o.done else HIDDEN
   at = mark_place(s, o, of)
   if k % o.per == 1:
     at = at + PIN * o.sides[of]
-  return at, NOW if of == o.done else look
+  return at, shown(of, o.done)
 
 
 class Navigate(Task):
@@ -283,6 +278,7 @@ class Navigate(Task):
     observe,
     ("target", "side", "horizon", "held"),
     metrics={name: name for name in ("horizon_angle", "off_centre", "out_of_view")},
+    columns={"visible": "seen", "centred": "centred", "horizon": "horizon"},
     act=act,
     mark=mark,
   )
@@ -323,7 +319,7 @@ class Navigate(Task):
     self.hold, self.follow, self.half = hold, follow, math.tan(FOVY / 2)
     self.targets = marks * self.per
     kwargs = {"spread": 0.045, "force_limit": 0.5, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=self.targets), random, **kwargs)
+    super().__init__(scene, random, **kwargs)
 
   def begin(self, physics: Physics) -> None:
     """Draws the marks, the sides that they are seen from, and the instrument's way."""
@@ -336,7 +332,8 @@ class Navigate(Task):
     views = [laparoscope.view(port, each, physics.optics) for each in poses]
     self.sides = np.array([axes[:, 2] for _, axes in views])
     stations = np.array([physics.tip_pos(), *(pos for pos, _ in views)])
-    self._path = float(np.linalg.norm(np.diff(stations, axis=0), axis=1).sum())
+    way = float(np.linalg.norm(np.diff(stations, axis=0), axis=1).sum())
+    self.reference_length = None if self.follow else way
     self.middle = self.swing = self.rate = self.phase = np.zeros(3)
     if physics.guided:
       hand = physics.guided.trocar()
@@ -362,12 +359,6 @@ class Navigate(Task):
     """Returns the radius of a mark, or of the end of its pin [m]."""
     return 0.0015 if k % self.per else 0.003
 
-  def recorded(self, physics: Physics) -> Mapping[str, float]:
-    """Returns whether it is seen and centred, and the horizon."""
-    return {
-      "visible": float(self.seen), "centred": float(self.centred), "horizon": self.horizon
-    }  # fmt: skip
-
   def instruct(self, physics: Physics) -> str:
     """Says what is wrong with the picture, the worst first."""
     what = "the instrument" if follows(self) else "the yellow mark"
@@ -385,10 +376,6 @@ class Navigate(Task):
       return "Turn the camera until the picture is level"
     wanted = self.follow if follows(self) else self.hold
     return f"Hold it there for {max(wanted - self.time, 0.0):.1f} s more"
-
-  def reference_length(self) -> float | None:
-    """Returns the length of the straight lines from view to view [m]; of what moves none."""
-    return None if self.follow else self._path
 
   def expert(self, p: Performer) -> Script:
     """Shows the marks one by one, then the instrument."""

@@ -42,7 +42,7 @@ from ..core.rules import (
 )
 from ..core.scenes import Scene
 from ..registry import exercise
-from .grasp import FUNDUS, READY, Held, Hold, follow, near, ready
+from .grasp import FUNDUS, GRIPS, READY, Held, Hold, follow, near, ready
 from .touch import SLACK
 
 _BEHIND = 0.02  # from the organ's middle to the disc [m]
@@ -142,8 +142,9 @@ class Retract(Hold):
 
   rules = Rules(
     State, advance, observe, ("target", "hidden", "visible", "held", "grasped"),
-    shaping=shaping, mark=mark,
+    columns=GRIPS, shaping=shaping, mark=mark,
   )  # fmt: skip
+  targets = 2
 
   def __init__(
     self, scene: Scene, random=None, *, radius: float, wanted: float, hold: float, **kwargs
@@ -158,10 +159,9 @@ class Retract(Hold):
       hold: for how long [s]
       **kwargs: see Task; the force limit counts the jaws too
     """
-    self.targets = 2
     self.radius, self.wanted, self.hold = radius, wanted, hold
     kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=2), random, **kwargs)
+    super().__init__(scene, random, **kwargs)
 
   def begin(self, physics: Physics) -> None:
     """Draws the site to grasp and hides the disc behind the organ's edge, far from the trocar."""
@@ -170,6 +170,7 @@ class Retract(Hold):
     self.rest = physics.point(self.site)
     _, center = self.place_of_work(physics)
     self.disc = self._hide(physics, center)
+    self.reference_length = self.distance0 + 4 * self.radius  # aside
 
   def mark_size(self, k: int) -> float:
     """Returns the disc's radius of the first, see `Task`."""
@@ -200,10 +201,6 @@ class Retract(Hold):
     if self.visible < self.wanted:
       return f"Pull it aside: {100 * self.visible:.0f} of {100 * self.wanted:.0f} % are seen"
     return f"Hold it there for {max(self.hold - self.time, 0.0):.1f} s more"
-
-  def reference_length(self) -> float:
-    """Returns the way to the site and aside by four radii of the disc [m]."""
-    return self.distance0 + 4 * self.radius
 
   def expert(self, p: Performer) -> Script:
     """Grasps and pulls aside, a little up, until enough is seen."""

@@ -10,7 +10,6 @@ which is what starts elsewhere. Success: all points. Failure: a force above the 
 time limit.
 """
 
-import dataclasses
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,9 +18,6 @@ from palpate.tissue.types import ints
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
 from ..core.rules import (
-  HIDDEN,
-  LATER,
-  NOW,
   RUNNING,
   SUCCESS,
   Rules,
@@ -33,6 +29,7 @@ from ..core.rules import (
   peak,
   point,
   reach,
+  shown,
   tip,
 )
 from ..core.scenes import Scene
@@ -134,8 +131,7 @@ def observe(s, o):
 
 def mark(s, o, k):
   """Marks the points that are left."""
-  look = LATER if k > o.done else HIDDEN
-  return point(s, o.goals[k]), NOW if k == o.done else look
+  return point(s, o.goals[k]), shown(k, o.done)
 
 
 class Touch(Task):
@@ -155,7 +151,7 @@ class Touch(Task):
     """
     self.targets, self.tolerance = points, tolerance
     kwargs = {"spread": 0.035, "force_limit": 0.5, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=points), random, **kwargs)
+    super().__init__(scene, random, **kwargs)
 
   def begin(self, physics: Physics) -> None:
     """Draws the points, apart from each other."""
@@ -165,7 +161,7 @@ class Touch(Task):
     self.pressing, self.spoilt = False, False
     self.distance0 = distance(physics, self)
     stations = np.array([physics.tip_pos(), *(physics.point(t) for t in self.goals)])
-    self._path = float(np.linalg.norm(np.diff(stations, axis=0), axis=1).sum())
+    self.reference_length = float(np.linalg.norm(np.diff(stations, axis=0), axis=1).sum())
 
   def label(self, kind: str) -> str:
     """Returns the number of the point."""
@@ -176,10 +172,6 @@ class Touch(Task):
     if self.pressing and self.spoilt:
       return "Let go of the organ"
     return f"Touch the yellow point gently, {self.done + 1} of {self.targets}"
-
-  def reference_length(self) -> float:
-    """Returns the length of the straight lines from point to point [m]."""
-    return self._path
 
   def expert(self, p: Performer) -> Script:
     """Touches the points one by one."""

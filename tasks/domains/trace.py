@@ -280,6 +280,7 @@ class Trace(Task):
 
   watch = ("miss", "unintended_contact", "drop")
   mark_radius = 0.0015
+  targets = MARKS
   rules = Rules(State, advance, observe, ("target", "ahead"), shaping=shaping, mark=mark)
 
   def __init__(
@@ -295,10 +296,9 @@ class Trace(Task):
       tolerance: largest distance of the tip from the curve [m]
       **kwargs: see Task
     """
-    self.targets = MARKS
     self.size, self.turns, self.tolerance = size, turns, tolerance
     kwargs = {"spread": 0.03, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=MARKS), random, **kwargs)
+    super().__init__(scene, random, **kwargs)
 
   def begin(self, physics: Physics) -> None:
     """Draws the curve: a wave in the plane across the shaft, dropped on the surface."""
@@ -318,6 +318,7 @@ class Trace(Task):
     self.tracing, self.touching = False, False
     self.now, self.count = self.curve, len(self.curve)
     self.distance0 = distance(physics, self)
+    self.reference_length = float(self.arc[-1]) + self.distance0
 
   def _draw(self, physics: Physics, center: np.ndarray, size: float):
     """Returns points, triangles and weights in them; None where the curve leaves the place."""
@@ -381,10 +382,6 @@ class Trace(Task):
   def constants(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns the curve to trace [m]."""
     return {"curve": self.curve}
-
-  def reference_length(self) -> float:
-    """Returns the length of the curve and of the way to it [m]."""
-    return float(self.arc[-1]) + self.distance0
 
   def expert(self, p: Performer) -> Script:
     """Goes along the curve in light contact."""

@@ -6,7 +6,7 @@ import palpate
 import palpate.batch
 import pytest
 from devices import needs_cuda
-from scenes import box, servo, sphere, triangular
+from scenes import abreast, box, off, servo, sphere, triangular
 
 BACKENDS = ["cpu", "warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
 SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
@@ -106,18 +106,10 @@ def test_a_cut_world_goes_on_as_the_plugin_does(device, windows, keys):
   alone, organ = palpate.Organ(model, data, "organ"), batch.organ("organ")
   alone.cut(LINE)
   batch.set_state(0, data)
-  force = []
-  for _ in range(40):
-    data.ctrl[:] = -0.013
-    batch.ctrl = np.full((2, 1), -0.013)
-    mujoco.mj_step(model, data)
-    batch.step()
-    total = organ.contact_force.numpy().sum(axis=1)
-    force.append((alone.contact_force.sum(axis=0)[2], *total[:, 2]))
-  force = np.array(force)
-  peak = np.abs(force[:, 0]).max()
-  assert peak > 0.1 and np.abs(force[:, 0] - force[:, 2]).max() > 0.1 * peak  # that is whole
-  assert np.sqrt(np.mean((force[:, 0] - force[:, 1]) ** 2)) < 1e-3 * peak
+  force = abreast(model, data, alone, batch, [-0.013] * 40)[..., 2]
+  peak = np.abs(force[:, -1]).max()
+  assert peak > 0.1 and np.abs(force[:, -1] - force[:, 1]).max() > 0.1 * peak  # that is whole
+  assert off(force) < 1e-3
   batch.get_state(0, data)
   mujoco.mj_forward(model, data)
   xpos = organ.xpos.numpy()[0]
@@ -343,10 +335,7 @@ def test_a_cut_solid_goes_on_as_the_plugin_does(device, windows):
     assert (done.area, done.nodes, done.depth) == (report.area, report.nodes, report.depth)
   whole, used = n, np.unique(alone.elem)  # a vertex may have got another number
   batch.set_state(1, data)
-  for _ in range(6):  # before the ball touches it
-    data.ctrl[:], batch.ctrl = 0.01, np.full((3, 1), 0.01)
-    mujoco.mj_step(model, data)
-    batch.step()
+  abreast(model, data, alone, batch, [0.01] * 6)  # before the ball touches it
   xpos = organ.xpos.numpy()
   assert np.isfinite(xpos).all(axis=2).sum(axis=1).tolist() == [len(used), len(used), whole]
   for world in (0, 1):
@@ -354,18 +343,11 @@ def test_a_cut_solid_goes_on_as_the_plugin_does(device, windows):
     np.testing.assert_allclose(xpos[world, used], alone.xpos[used], atol=2e-7)
   np.testing.assert_allclose([piece.mass for piece in organ.pieces[0]],
                              [piece.mass for piece in alone.pieces], rtol=1e-6)  # fmt: skip
-  force = []
-  for _ in range(20):
-    data.ctrl[:], batch.ctrl = -0.008, np.full((3, 1), -0.008)
-    mujoco.mj_step(model, data)
-    batch.step()
-    total = organ.contact_force.numpy().sum(axis=1)[:, 2]
-    force.append((alone.contact_force.sum(axis=0)[2], *total))
-  force = np.array(force)
-  peak = np.abs(force[:, 0]).max()
-  assert peak > 0.1 and np.sqrt(np.mean((force[:, 0] - force[:, 1]) ** 2)) < 1e-3 * peak
-  np.testing.assert_array_equal(force[:, 1], force[:, 2])
-  assert np.abs(force[:, 0] - force[:, 3]).max() > 0.3 * peak  # that is whole
+  force = abreast(model, data, alone, batch, [-0.008] * 20)[..., 2]
+  peak = np.abs(force[:, -1]).max()
+  assert peak > 0.1 and off(force) < 1e-3
+  np.testing.assert_array_equal(force[:, 0], force[:, 1])
+  assert np.abs(force[:, -1] - force[:, 2]).max() > 0.3 * peak  # that is whole
   batch.get_state(0, data)
   mujoco.mj_forward(model, data)
   np.testing.assert_allclose(alone.xpos[used], organ.xpos.numpy()[0, used], atol=2e-7)

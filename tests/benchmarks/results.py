@@ -9,7 +9,8 @@ import os
 import pathlib
 import platform
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 from palpate.app.console import CommandError
 
@@ -183,14 +184,25 @@ def caption(about: dict) -> str:
   return f"{line}." if line else ""
 
 
-def page(
-  path: pathlib.Path,
-  title: str,
-  about: dict,
-  lines: list[str],
-  finding: list[str],
-  plot: pathlib.Path | None = None,
-) -> pathlib.Path:
+class Page(NamedTuple):
+  """What a bench tells of its rows.
+
+  Attributes:
+    title: of the page
+    finding: one to three lines that answer the page's question, with numbers from the rows
+    lines: tables and what explains them
+    pictures: what was drawn, in the folder of the page; the first shows the finding
+    name: of the file, if not that of the bench
+  """
+
+  title: str
+  finding: list[str]
+  lines: list[str]
+  pictures: Sequence[pathlib.Path] = ()
+  name: str = ""
+
+
+def write(path: pathlib.Path, page: Page, about: dict) -> pathlib.Path:
   """Writes a page and returns its path.
 
   A page begins with its title, its finding and its plot. What its rows are older than (`older` in
@@ -199,18 +211,15 @@ def page(
 
   Args:
     path: the page
-    title: its title
+    page: what it says
     about: notes on the machine and the run
-    lines: tables and what explains them
-    finding: one to three lines that answer the page's question, with numbers from the rows
-    plot: the picture that shows the finding, in the folder of the page
   """
-  if len(finding) > 3:
-    raise ValueError(f"{path.name}: the finding has {len(finding)} lines, expected at most 3")
-  head = [f"- {line}" for line in finding or ["Too few rows for a finding."]]
+  if len(page.finding) > 3:
+    raise ValueError(f"{path.name}: the finding has {len(page.finding)} lines, expected at most 3")
+  head = [f"- {line}" for line in page.finding or ["Too few rows for a finding."]]
   if about.get("done", 0) < about.get("cases", 0):
     head += ["", f"The run is incomplete: {about['done']} of {about['cases']} cases."]
-  head += ["", f"![{title}]({plot.name})"] if plot else []
+  head += ["", f"![{page.title}]({page.pictures[0].name})"] if page.pictures else []
   head += ["", f"**Older.** {about['older']}"] if about.get("older") else []
   command = f"    palpate bench {about.get('bench', path.stem)}"
   command += " --short" if about.get("short") else ""
@@ -221,7 +230,7 @@ def page(
     if options.get(key, "None") not in ("None", "cpu")
   )
   known = [word for line in (caption(about), command) if line for word in (line, "")]
-  text = "\n".join([f"# {title}", "", *head, "", *known, *lines]).rstrip("\n") + "\n"
+  text = "\n".join([f"# {page.title}", "", *head, "", *known, *page.lines]).rstrip("\n") + "\n"
   before = path.read_text(encoding="utf-8") if path.exists() else ""
   _, mark, remarks = before.partition(REMARKS)
   path.write_text(text + mark + remarks, encoding="utf-8")

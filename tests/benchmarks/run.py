@@ -27,7 +27,6 @@ BENCHES = {
   "peer": "run time against error, beside MuJoCo's native flex, tolerance by tolerance",
   "pictures": "pictures a second in many worlds, beside mujoco_warp's renderer",
   "policies": "success of the policies that ship",
-  "rest": "a sleeping organ against none",
   "skill": "metrics: expert against novices",
   "skipping": "what switching each feature off saves",
   "solver": "the implicit step alone, device by device",

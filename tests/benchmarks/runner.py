@@ -26,7 +26,7 @@ SEED = 20080401  # of every random draw of the benches
 
 
 def _nothing(*_):
-  return []
+  pass
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Bench:
       is done. A case is a dict with a unique `case`, numbers and words only.
     run: returns the rows of a case; the second argument is the output folder
     columns: columns of the CSV, after `case` and `status`; those of the first row if empty
-    report: draws figures and writes a page from rows, notes and folder; returns their paths
+    report: draws figures and returns the page, from the rows of cases that ended and the CSV
     arguments: declares options of its own
     begin: called with the options before the first case
     file: name of the CSV, if not `name`; "{device}" in it is the kind of device of the options
@@ -51,7 +51,7 @@ class Bench:
   stages: Callable[[argparse.Namespace], list[list[Case]]]
   run: Callable[[Case, pathlib.Path], list[Row]]
   columns: tuple[str, ...] = ()
-  report: Callable[[list[Row], dict, pathlib.Path], list[pathlib.Path]] = _nothing
+  report: Callable[[list[Row], pathlib.Path], results.Page] | None = None
   arguments: Callable[[argparse.ArgumentParser], object] = _nothing
   begin: Callable[[argparse.Namespace], object] = _nothing
   file: str = ""
@@ -219,9 +219,15 @@ def _work(
 def report(bench: Bench, args: argparse.Namespace) -> list[pathlib.Path]:
   """Draws figures and page from the rows there are and returns the paths of all files."""
   path = bench.path(args)
+  if bench.report is None:
+    return [path]
   rows = results.read(path)
-  written = bench.report(rows, results.notes(path), path.parent)
-  return [path, *written]
+  page = bench.report([row for row in rows if row["status"] == "ok"], path)
+  lost = [f"{row['case']} ({row['status']})" for row in rows if row["status"] != "ok"]
+  if lost:
+    page.lines.extend(["", f"Not run to an end: {', '.join(lost)}"])
+  name = path.with_name(f"{page.name or bench.name}.md")
+  return [path, *page.pictures, results.write(name, page, results.notes(path))]
 
 
 def clock() -> float:

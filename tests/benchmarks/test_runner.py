@@ -78,13 +78,15 @@ def test_results_of_another_form_are_not_resumed(tmp_path):
 
 def test_a_page_written_again_keeps_the_remarks(tmp_path):
   path, about = tmp_path / "small.md", {"palpate": "1", "bench": "small", "short": True}
-  results.page(path, "Small", about, ["table"], ["It is 2 mm."], tmp_path / "small.png")
+  results.write(
+    path, results.Page("Small", ["It is 2 mm."], ["table"], [tmp_path / "small.png"]), about
+  )
   assert path.read_text() == (
     "# Small\n\n- It is 2 mm.\n\n![Small](small.png)\n\npalpate 1.\n\n"
     "    palpate bench small --short\n\ntable\n"
   )
   path.write_text(path.read_text() + "\n## Remarks\n\n- by hand\n")
-  results.page(path, "Small", about, ["another table"], ["It is 3 mm."])
+  results.write(path, results.Page("Small", ["It is 3 mm."], ["another table"]), about)
   assert path.read_text().endswith("another table\n\n## Remarks\n\n- by hand\n")
 
 

@@ -20,7 +20,7 @@ def command(*words) -> int:
   "page", sorted(results.FOLDER.rglob("[a-z]*.md")), ids=lambda page: page.stem
 )
 def test_a_page_begins_with_its_finding_and_its_plot(page):
-  """`results.page` writes them so; `--draw` writes a page again from its rows."""
+  """`results.write` writes them so; `--draw` writes a page again from its rows."""
   title, blank, *rest = page.read_text(encoding="utf-8").splitlines()
   finding = list(itertools.takewhile(lambda line: line.startswith("- "), rest))
   assert title.startswith("# ") and not blank and 1 <= len(finding) <= 3
@@ -30,7 +30,7 @@ def test_a_page_begins_with_its_finding_and_its_plot(page):
 
 def test_a_finding_has_at_most_three_lines(tmp_path):
   with pytest.raises(ValueError, match="4 lines, expected at most 3"):
-    results.page(tmp_path / "long.md", "Long", {}, [], ["line"] * 4)
+    results.write(tmp_path / "long.md", results.Page("Long", ["line"] * 4, []), {})
 
 
 def test_solver_is_timed_with_both_preconditioners(tmp_path):
@@ -101,10 +101,3 @@ def test_peer_is_beside_ours(tmp_path):
       assert flex["error"] > 1.5 * right["error"] > 0
   page = (tmp_path / "peer.md").read_text()
   assert "times ours" in page and "A step of 1 ms" in page
-
-
-@pytest.mark.slow
-def test_a_sleeping_organ_is_timed(tmp_path):
-  assert command("rest", "--short", "-o", tmp_path) == 0
-  rows = results.read(tmp_path / "rest_cpu.csv")
-  assert all(row["asleep_us"] < row["awake_us"] for row in rows)

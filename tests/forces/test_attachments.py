@@ -55,14 +55,12 @@ def test_a_patch_follows_a_mocap_body_and_feels_it(make):
   mujoco.mj_forward(model, data)
   grip = organ.attach(_top(organ), "hook")
   data.mocap_pos[0] += [0.002, 0, 0.003]
-  for _ in range(400):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 400)
   np.testing.assert_allclose(organ.displacement[grip.vertices][:, 2], 0.003, atol=2e-4)
   area = np.linalg.norm(organ.displacement, axis=1)
   assert grip.force[2] > 0.05 and grip.force[0] > 0.01 and area.min() < 1e-3
   grip.detach()
-  for _ in range(800):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 800)
   assert np.abs(organ.displacement).max() < 2e-4 and not grip.force.any()
 
 
@@ -72,8 +70,7 @@ def test_a_declared_attachment_holds_what_hangs_from_it(make, scenes):
   slide = HOOK.format(joint='<joint name="s" type="slide" axis="0 0 1" stiffness="1000"/>')
   model, data, organ = make(slide, gravity=(0, 0, -9.81), attach=f"hook 800 {top}", damping=0.02)
   model.dof_damping[model.joint("s").dofadr[0]] = 30.0
-  for _ in range(1500):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 1500)
   # The spring of the slide carries both.
   weight = 9.81 * (0.5 + scenes.masses(organ).sum())
   assert 1000 * -_place(model, data, "s") == pytest.approx(weight, rel=0.01)
@@ -103,8 +100,7 @@ def test_organs_attached_to_each_other_hang_on_one(scenes):
   made = scenes.world(upper + lower + scenes.ball(1.0, joint=False), gravity=(0, 0, -9.81))
   model, data, organ = scenes.load(made, "upper")
   other = palpate.Organ(model, data, "lower")
-  for _ in range(1500):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 1500)
   drop = -other.displacement[:, 2].mean()
   assert 0.1 * 9.81 / 400 < drop < 0.06
   pull = scenes.workspace(organ).attachments
@@ -120,8 +116,7 @@ def test_a_carried_organ_feels_no_constant_velocity(make):
   model, data, organ = make(CART, foundation=1e4, carrier="cart")
   data.qvel[model.joint("x").dofadr[0]] = 0.3
   organ.set_state(xvel=np.tile([0.3, 0, 0], (organ.nvert, 1)))
-  for _ in range(200):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 200)
   assert _place(model, data, "x") == pytest.approx(0.06, abs=1e-6)
   np.testing.assert_allclose(organ.displacement, np.tile([0.06, 0, 0], (organ.nvert, 1)), atol=1e-7)
 
@@ -144,8 +139,7 @@ def test_a_carried_organ_turns_with_its_carrier(make):
   model, data, organ = make(CART, foundation=1e4, carrier="cart")
   data.qvel[model.joint("turn").dofadr[0]] = 3.0
   organ.set_state(xvel=np.cross([0, 0, 3.0], organ.xpos0))
-  for _ in range(300):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 300)
   angle = _place(model, data, "turn")
   turn = np.array(
     [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
@@ -158,8 +152,7 @@ def test_a_foundation_of_its_own_motion_lets_an_organ_fall_and_turn(make, scenes
   model, data, organ = make("", gravity=(0, 0, -9.81), foundation=1e4, carrier="own")
   spin = np.array([1.0, 2.0, 3.0])
   organ.set_state(xvel=np.cross(spin, organ.xpos0) + np.array([0.1, 0, 0]))
-  for _ in range(200):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 200)
   mass = scenes.masses(organ)[:, None]
   middle, vel = ((mass * each).sum(0) / mass.sum() for each in (organ.xpos, organ.xvel))
   np.testing.assert_allclose(vel, [0.1, 0, -9.81 * 0.2], atol=2e-3)
@@ -192,18 +185,15 @@ def test_a_copy_is_attached_too_and_a_reset_lets_go(make):
   mujoco.mj_forward(model, data)
   organ.attach(_top(organ), "hook", 300)
   data.mocap_pos[0] += [0, 0, 0.005]
-  for _ in range(20):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 20)
   other = copy.copy(data)
   twin = palpate.Organ(model, other, "organ")
   for each in (data, other):
-    for _ in range(20):
-      mujoco.mj_step(model, each)
+    mujoco.mj_step(model, each, 20)
   np.testing.assert_array_equal(twin.xpos, organ.xpos)
   mujoco.mj_resetData(model, data)
   data.mocap_pos[0] += [0, 0, 0.005]
-  for _ in range(20):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 20)
   assert np.abs(organ.displacement).max() < 1e-9 and np.abs(twin.displacement).max() > 1e-4
 
 

@@ -92,8 +92,7 @@ def test_an_organ_and_a_free_body_bonded_together_keep_their_momentum(make, scen
   mujoco.mj_forward(model, data)
   dof, adr = model.joint("free").dofadr[0], model.joint("free").qposadr[0]
   data.qvel[dof : dof + 3] = 0.1, 0, 0.2
-  for _ in range(200):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 200)
   assert 0.1 < organ.bonds.damage.mean()
   momentum = (scenes.masses(organ)[:, None] * organ.xvel).sum(0)
   momentum += 0.5 * data.qvel[dof : dof + 3]
@@ -120,8 +119,7 @@ def _two(scenes, gravity=(0, 0, -9.81), first="upper", **keys):
 def test_an_organ_hangs_by_its_bonds_on_another(scenes):
   model, data, upper, lower = _two(scenes, bonds="lower 1e6 5e3 50 near 0.002")
   assert len(upper.bonds) == 36 and not len(lower.bonds)
-  for _ in range(600):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 600)
   np.testing.assert_allclose(upper.bonds.force.sum(axis=0), [0, 0, -0.981], atol=0.01)
   assert np.abs(lower.xvel).max() < 5e-3 and not upper.bonds.damage.any()
   assert upper.error is None and lower.error is None
@@ -131,8 +129,7 @@ def test_forces_between_organs_are_the_same_whichever_comes_first(scenes):
   found = []
   for first in ("upper", "lower"):
     model, data, upper, _ = _two(scenes, first=first, bonds="lower 1e6 5e3 50 near 0.002")
-    for _ in range(20):
-      mujoco.mj_step(model, data)
+    mujoco.mj_step(model, data, 20)
     found.append(upper.bonds.force)
   np.testing.assert_allclose(found[1], found[0], atol=1e-3 * np.abs(found[0]).max())
 
@@ -296,13 +293,11 @@ def test_bonds_of_python_are_copied_and_end_with_a_reset(make):
   organ.bond("world", *LAW, vertices=[3, 17])
   organ.bond("hand", *LAW, vertices=[40])
   data.mocap_pos[0] += [0, 0, 0.0005]
-  for _ in range(20):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 20)
   other = copy.copy(data)
   twin = palpate.Organ(model, other, "organ")
   for each in (data, other):
-    for _ in range(20):
-      mujoco.mj_step(model, each)
+    mujoco.mj_step(model, each, 20)
   np.testing.assert_array_equal(twin.xpos, organ.xpos)
   assert len(twin.bonds) == 3 and np.abs(twin.bonds.force[2]).max() > 0
   organ.bond("hand", *LAW, vertices=[41])
@@ -389,8 +384,7 @@ def test_the_distance_of_a_strand_is_that_of_its_nearest_point(make):
   mujoco.mj_forward(model, data)
   organ.bond("hand", 1e4, 1e5, 1e6, vertices=np.arange(40))
   data.mocap_pos[0] += [0.004, 0.003, 0.01]
-  for _ in range(3):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 3)
   bonds, share = organ.bonds, np.linspace(0, 1, 400)
   assert np.linalg.norm(bonds.stretch, axis=1).min() > 0.005
   for start, end in [([0, 0, 0.05], [0.01, 0.02, 0.06]), ([0.03, 0, 0], [0.03, 0, 0.0])]:

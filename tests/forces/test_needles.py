@@ -82,8 +82,7 @@ def test_a_needle_that_is_drawn_out_leaves_no_hole():
   drive(model, data, organ, [1.6])
   assert len(organ.pinholes) == 1
   drive(model, data, organ, [0.0])
-  for _ in range(300):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 300)
   assert not organ.pinholes
   assert np.abs(organ.displacement).max() < 5e-5
   assert np.abs(organ.needles[0].force).max() < 1e-3
@@ -155,7 +154,7 @@ def test_both_layers_of_a_wall_are_pierced_by_their_own_toughness(free):
   model, data, organ = load(wall(free=free))
   lower = palpate.Organ(model, data, "lower")
   layers, seen, energy, holes = (organ, lower), [], [], []
-  for angle in np.arange(0.0, 3.4, 2e-3):
+  for angle in np.arange(0.0, 3.4, 3e-3):
     data.ctrl[0] = angle
     mujoco.mj_step(model, data)
     along = data.site("needle_tip").xmat.reshape(3, 3)[:, 2]
@@ -307,8 +306,7 @@ def test_a_cut_through_a_pinhole_opens_it(nodes):
   assert hole.thread == (nodes > 0)
   organ.cut([(hole.rest[0], y, 0) for y in np.linspace(-0.008, 0.008, 12)])
   assert len(organ.pinholes) == len(others)
-  for _ in range(50):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 50)
   assert organ.error is None
 
 
@@ -325,8 +323,7 @@ def test_pinholes_of_a_solid_stay_where_they_are_beside_a_cut():
   assert len(after) == len(before) > 2
   for old, new in zip(before, after, strict=True):
     assert new.rest == pytest.approx(old.rest, abs=1e-9 if old.inside else 1e-4)
-  for _ in range(50):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 50)
   assert organ.error is None
 
 

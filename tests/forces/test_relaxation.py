@@ -66,12 +66,10 @@ def test_a_relaxing_organ_goes_on_to_the_bit_from_a_saved_state(scenes):
   model, data, organ, grip = _bar(scenes, "window")
   _pull(model, data, grip, 0.05)
   state = scenes.state(model, data)
-  for _ in range(20):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 20)
   expected = organ.xpos
   mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
-  for _ in range(20):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 20)
   np.testing.assert_array_equal(organ.xpos, expected)
 
 
@@ -80,8 +78,7 @@ def test_a_free_relaxing_organ_keeps_its_momentum(scenes):
   body = scenes.windowed(points, elem, **KEYS) + scenes.ball(1.0, joint=False)
   model, data, organ = scenes.load(scenes.world(body))
   organ.set_state(points * [1.1, 1, 0.9], np.tile([0.1, 0, 0], (len(points), 1)))
-  for _ in range(200):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 200)
   mass = scenes.workspace(organ).organ.windows.mass
   np.testing.assert_allclose(mass @ organ.xvel, [0.001, 0, 0], atol=1e-7)
   assert organ.energy < 1e-4

@@ -127,8 +127,7 @@ def check(seed: int):
       return
     random = np.random.RandomState(seed)
     organ.set_state(xvel=0.01 * random.uniform(-1, 1, (organ.nvert, 3)))
-    for _ in range(20):
-      mujoco.mj_step(model, data)
+    mujoco.mj_step(model, data, 20)
   finally:
     mujoco.set_mju_user_warning(None)
   assert names or organ.error is None, organ.error

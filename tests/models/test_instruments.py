@@ -25,8 +25,7 @@ def _load(name, handle=False, timestep=0.002, integrator=INTEGRATORS[0]):
 
 
 def _step(model, data, seconds):
-  for _ in range(round(seconds / model.opt.timestep)):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, round(seconds / model.opt.timestep))
 
 
 def _settled_at(model, insertion):

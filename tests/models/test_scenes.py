@@ -124,8 +124,7 @@ def test_instruments_and_handles(instruments, handle):
   for key in range(model.nkey):
     mujoco.mj_resetDataKeyframe(model, data, key)
     start = data.site_xpos.copy()
-    for _ in range(100):
-      mujoco.mj_step(model, data)
+    mujoco.mj_step(model, data, 100)
     assert np.isfinite(data.qpos).all()
     if model.key(key).name != "press":
       mujoco.mj_kinematics(model, data)
@@ -136,8 +135,7 @@ def test_instruments_and_handles(instruments, handle):
     mujoco.mj_forward(model, data)
     goal = data.site(f"{prefix}tip").xpos + np.array([0.01, 0.005, 0.0])
     Handle(model, data, prefix).move(goal)
-    for _ in range(600):
-      mujoco.mj_step(model, data)
+    mujoco.mj_step(model, data, 600)
     np.testing.assert_allclose(data.site(f"{prefix}tip").xpos, goal, atol=2e-4)
 
 

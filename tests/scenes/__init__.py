@@ -10,7 +10,7 @@ from .bare import force, get, kernels, put, step
 from .documents import ball, contacts, flex, organ, plugin, press, probed, ridge, windowed, world
 from .numbers import bodies, dofs, lump, masses, qposs, slot_bodies, slots, workspace
 from .resting import resting, watch
-from .running import Warnings, adrift, beside, drive, follow, goes_on, grasp, load, motion, run
-from .running import settle, state
+from .running import Warnings, abreast, adrift, beside, draw, drive, follow, goes_on, grasp, load
+from .running import motion, off, run, settle, state
 from .specs import servo
 from .surfaces import RADIUS, sphere, strip, triangular

@@ -43,8 +43,7 @@ def load(*args, **kwargs):
 
 
 def run(model, data, steps):
-  for _ in range(steps):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, steps)
 
 
 def force(model, data, node, value):

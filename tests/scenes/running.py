@@ -119,6 +119,37 @@ def adrift(**settings):
   return model, data, made
 
 
+def abreast(model, data, organ, batch, ctrls):
+  """Moves the plugin and all worlds of a batch by the same controls; a row a step in `ctrls`.
+
+  Returns:
+    forces of contact on an organ in each world, and last those of the plugin [N]
+      (nstep, nworld + 1, 3)
+  """
+  out = []
+  for ctrl in ctrls:
+    data.ctrl[:] = ctrl
+    batch.ctrl = np.tile(data.ctrl, (batch.nworld, 1))
+    mujoco.mj_step(model, data)
+    batch.step()
+    found = batch.organ(organ.name).contact_force.numpy().sum(axis=1)
+    out.append([*found, organ.contact_force.sum(axis=0)])
+  return np.array(out)
+
+
+def off(found, world=0):
+  """Returns how far forces of `abreast` in a world are from the plugin's: RMS by its peak [-]."""
+  expected = found[:, -1]
+  return np.sqrt(np.mean((found[:, world] - expected) ** 2)) / np.abs(expected).max()
+
+
+def draw(model, data, drawn):
+  """Draws a state into an MjvScene, as a viewer does."""
+  everything = mujoco.mjtCatBit.mjCAT_ALL.value
+  about = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
+  mujoco.mjv_updateScene(model, data, *about, everything, drawn)
+
+
 class Warnings:
   """Collects MuJoCo's warnings instead of a log file."""
 

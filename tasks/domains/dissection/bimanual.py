@@ -231,6 +231,7 @@ class Bimanual(Dissect):
     observe,
     (*Dissect.rules.observed, "hook_front", "hook_gap", "retracted", "burnt"),
     METRICS | {"current_time": "powered", "current_wasted": "wasted"},
+    {**Dissect.rules.columns, "current": "powered", "idle_current": "wasted"},
     act=act,
     mark=Dissect.rules.mark,
   )
@@ -256,11 +257,6 @@ class Bimanual(Dissect):
     self.rest = physics.point(self.site)
     away = self.rest - middle(physics)
     self.away = away / np.linalg.norm(away)
-
-  def recorded(self, physics: Physics) -> dict[str, float]:
-    """Returns for how long the current was on, too."""
-    own = {"current": self.powered, "idle_current": self.wasted}
-    return dict(super().recorded(physics)) | own
 
   def harsh(self, physics: Physics) -> bool:
     """Returns whether a force is over its limit, or the hook burns what it touches."""

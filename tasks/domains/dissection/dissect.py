@@ -39,8 +39,8 @@ from ...core.rules import (
 )
 from ...core.scenes import Scene
 from ...registry import exercise
-from ..grasp import FUNDUS, Held, Hold, distance, follow
-from .freeing import METRICS, Freed, Freeing, count, earned, held, holding
+from ..grasp import FUNDUS, GRIPS, Held, Hold, distance, follow
+from .freeing import COLUMNS, METRICS, Freed, Freeing, count, earned, held, holding
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed, and of a tough one. Ours: we know
 # of no measurement; the bed bears the organ, and comes away under half a newton or one.
@@ -132,8 +132,9 @@ class Dissect(Freeing, Hold):
   """Free an organ from its bed by traction."""
 
   rules = Rules(
-    State, advance, observe, ("target", "front", "freed", "traction", "grasped"), METRICS, mark=mark
-  )
+    State, advance, observe, ("target", "front", "freed", "traction", "grasped"), METRICS,
+    COLUMNS | GRIPS, mark=mark,
+  )  # fmt: skip
   slip = 0.006
 
   def __init__(self, scene: Scene, random=None, *, wanted: float, traction: float = 1.5, **kwargs):
@@ -146,16 +147,16 @@ class Dissect(Freeing, Hold):
       traction: limit of the pull on the liver [N]
       **kwargs: see Task; the force limit counts the jaws too
     """
-    self.targets = 1
     kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
     kwargs |= {"wanted": wanted, "traction": traction}
-    super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
+    super().__init__(scene, random, **kwargs)
 
   def begin(self, physics: Physics) -> None:
     """Draws the site to grasp."""
     super().begin(physics)
     self.whole(physics)
     self.last = physics.tip_pos()
+    self.reference_length = self.distance0 + 0.03  # off the bed
 
   def instruct(self, physics: Physics) -> str:
     """Says to grasp, or to pull."""
@@ -164,10 +165,6 @@ class Dissect(Freeing, Hold):
     if self.traction > self.limit:
       return "Pull less: the liver gives"
     return f"Pull it off its bed: {100 * self.clean:.0f} of {100 * self.wanted:.0f} % are free"
-
-  def reference_length(self) -> float:
-    """Returns the way to the site and off the bed [m]."""
-    return self.distance0 + 0.03
 
   def expert(self, p: Performer) -> Script:
     """Grasps and pulls away from the bed, and grasps again what slipped."""

@@ -35,6 +35,7 @@ class Freed:
 
 
 METRICS = {"share_freed": "clean", "peak_traction": "pulled"}
+COLUMNS = {"freed": "clean", "traction": "traction"}
 
 
 # The rules.
@@ -136,7 +137,3 @@ class Freeing(Task):
     if self.torn > 1.0 - self.wanted + SEEN:
       return f"torn off: {100 * self.torn:.0f} %"
     return f"torn by a pull of {self.traction:.2f} N"
-
-  def recorded(self, physics: Physics) -> dict[str, float]:
-    """Returns the share that is clean and the pull."""
-    return dict(super().recorded(physics)) | {"freed": self.clean, "traction": self.traction}

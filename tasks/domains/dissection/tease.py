@@ -35,7 +35,7 @@ from ...core.rules import (
 from ...core.scenes import Scene
 from ...registry import exercise
 from . import adhesion
-from .freeing import METRICS, Freed, Freeing, count, earned, held, holding
+from .freeing import COLUMNS, METRICS, Freed, Freeing, count, earned, held, holding
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2]: ours, we know of no measurement.
 FILMY, DENSE = (1e7, 6e3, 6.0), (1e7, 8e3, 12.0)
@@ -129,7 +129,9 @@ class Tease(Freeing):
   """Free a strip by blunt strokes."""
 
   watch = ("unintended_contact",)
-  rules = Rules(State, advance, observe, ("target", "freed", "traction"), METRICS, mark=mark)
+  rules = Rules(
+    State, advance, observe, ("target", "freed", "traction"), METRICS, COLUMNS, mark=mark
+  )
   slots = 24
 
   def __init__(
@@ -168,15 +170,13 @@ class Tease(Freeing):
     self.whole(physics)
     self.front, self.nearest = front(physics), 0.0
     self.distance0 = distance(physics, self)
+    lanes = self.wanted * adhesion.LENGTH * adhesion.WIDTH / _LANE
+    self.reference_length = self.distance0 + 2 * lanes  # there and back
 
   def instruct(self, physics: Physics) -> str:
     """Says to stroke."""
     share = f"{100 * self.clean:.0f} of {100 * self.wanted:.0f} % are free"
     return f"Go under the flap and push gently along, side by side: {share}"
-
-  def reference_length(self) -> float:
-    """Returns the way to the strip and there and back along its lanes [m]."""
-    return self.distance0 + 2 * self.wanted * adhesion.LENGTH * adhesion.WIDTH / _LANE
 
   def expert(self, p: Performer) -> Script:
     """Strokes under the strip, lane by lane, a little beyond where it holds."""

@@ -159,7 +159,7 @@ class Palpate(Task):
         f"{name}: model is given, expected none: the organ is made with its inclusion"
       )
     kwargs = {"spread": 0.036, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=1), random, name=name, **kwargs)
+    super().__init__(scene, random, name=name, **kwargs)
 
   @property
   def extra(self) -> tuple[str, ...]:

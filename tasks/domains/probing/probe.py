@@ -33,9 +33,6 @@ from palpate.tissue.types import Array, ints
 from ...core.base import Physics, Task
 from ...core.performer import Performer, Script
 from ...core.rules import (
-  HIDDEN,
-  LATER,
-  NOW,
   RUNNING,
   SUCCESS,
   Rules,
@@ -49,6 +46,7 @@ from ...core.rules import (
   normal,
   reach,
   root,
+  shown,
   tip,
 )
 from ...core.scenes import Scene
@@ -199,8 +197,7 @@ def observe(s, o):
 
 def mark(s, o, k):
   """Marks the sites that are left."""
-  look = LATER if k > o.done else HIDDEN
-  return o.points[k], NOW if k == o.done else look
+  return o.points[k], shown(k, o.done)
 
 
 class Press(Task):
@@ -236,7 +233,7 @@ class Press(Task):
     self.low, self.high = band
     self.tolerance, self.by_depth = tolerance, by_depth
     kwargs = {"spread": 0.035, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=sites), random, **kwargs)
+    super().__init__(scene, random, **kwargs)
 
   def begin(self, physics: Physics) -> None:
     """Draws the sites, apart from each other."""
@@ -246,9 +243,8 @@ class Press(Task):
     self.normals = physics.normals()[self.goals]
     self.done, self.time, self.pressing = 0, 0.0, False
     self.distance0 = distance(physics, self)
-    self._path = float(
-      np.linalg.norm(np.diff([physics.tip_pos(), *self.points], axis=0), axis=1).sum()
-    )
+    stations = np.array([physics.tip_pos(), *self.points])
+    self.reference_length = float(np.linalg.norm(np.diff(stations, axis=0), axis=1).sum())
 
   def label(self, kind: str) -> str:
     """Returns the number of the site."""
@@ -264,10 +260,6 @@ class Press(Task):
     if much > self.high:
       return "Press less"
     return f"Hold it there for {max(self.hold - self.time, 0.0):.1f} s more"
-
-  def reference_length(self) -> float:
-    """Returns the length of the straight lines from site to site [m]."""
-    return self._path
 
   def expert(self, p: Performer) -> Script:
     """Presses the sites one by one."""

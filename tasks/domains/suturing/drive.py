@@ -16,7 +16,6 @@ marks, and the tip out by 5 mm. Failure: a hole farther from its mark, a needle 
 for half a second, a force of the needle on the wall above the damage limit, or the time limit.
 """
 
-import dataclasses
 import math
 from typing import Annotated, Any
 
@@ -169,6 +168,7 @@ class Drive(Stitching):
     observe,
     ("target", "way", "circle", "middle", "pierced", "out", "holds"),
     metrics={"peak_traction": "pulled", "bite_depth": "deepest"},
+    columns={"traction": "pull", "bite": "deepest"},
     mark=mark_hole,
   )
   targets = 2
@@ -195,7 +195,7 @@ class Drive(Stitching):
     """
     self.tolerance, self.turn, self.tough = tolerance, math.radians(turn), tough
     kwargs = {"force_limit": 2.0, "damage": 6.0, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=2), random, **kwargs)
+    super().__init__(scene, random, **kwargs)
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: a wall in a frame, and the needle."""
@@ -220,10 +220,6 @@ class Drive(Stitching):
     self.out = self.deepest = self.pull = self.pulled = self.pierced = 0.0
     self.holds, self.target, self.circle, self.middle = 1.0, *np.zeros((3, 3))
     self.start0 = float(np.linalg.norm(tip - self.marks[0]))
-
-  def recorded(self, physics: Physics) -> dict[str, float]:
-    """Returns the needle's pull on the wall, and how deep it went."""
-    return {"traction": self.pull, "bite": self.deepest}
 
   def instruct(self, physics: Physics) -> str:
     """Says what is next."""

@@ -17,9 +17,6 @@ from ...core.base import Physics, Task
 from ...core.performer import Performer, Script
 from ...core.rules import (
   FAR,
-  HIDDEN,
-  LATER,
-  NOW,
   drop,
   length,
   needle_place,
@@ -29,6 +26,7 @@ from ...core.rules import (
   pinhole,
   reach,
   root,
+  shown,
   sine,
   tip,
   vector,
@@ -132,8 +130,7 @@ def open_holes(s, o, count):
 
 def mark_hole(s, o, k):
   """Marks the holes that are left to make, the next one in yellow."""
-  look = LATER if k > o.holes else HIDDEN
-  return o.marks[k] + vector(0.0, 0.0, MARK), NOW if k == o.holes else look
+  return o.marks[k] + vector(0.0, 0.0, MARK), shown(k, o.holes)
 
 
 def lowest(s):

@@ -25,7 +25,6 @@ Failure: a hole farther from its mark than the tolerance, a stitch that is torn 
 nobody holds for half a second, a force on the wall above the damage limit, or the time limit.
 """
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Callable
@@ -44,10 +43,7 @@ from ...core.performer import Performer, Script
 from ...core.rules import (
   DAMAGED,
   FAR,
-  HIDDEN,
-  LATER,
   MISSED,
-  NOW,
   RUNNING,
   SUCCESS,
   Rules,
@@ -59,6 +55,7 @@ from ...core.rules import (
   needle_place,
   pierced,
   pinhole,
+  shown,
   taut,
   torn_at,
   vector,
@@ -263,8 +260,7 @@ def observe(s, o):
 
 def mark(s, o, k):
   """Marks the holes that are left, the next one in yellow."""
-  look = LATER if k > o.holes else HIDDEN
-  return place(s, o, k) + vector(0.0, 0.0, MARK), NOW if k == o.holes else look
+  return place(s, o, k) + vector(0.0, 0.0, MARK), shown(k, o.holes)
 
 
 class Running(Stitching):
@@ -278,6 +274,8 @@ class Running(Stitching):
      "right_holds", "left_holds"),
     metrics={"peak_traction": "pulled", "bite_depth": "deepest", "regrasps": "regrasps",
              "final_gap": "gap", "peak_tension": "tightest", "tearing": "torn"},
+    columns={"traction": "pull", "bite": "deepest", "regrasped": "regrasps", "gap": "gap",
+             "tension": "tight", "torn": "torn"},
     mark=mark,
   )  # fmt: skip
   targets = 2 * STITCHES
@@ -311,7 +309,7 @@ class Running(Stitching):
     self.edges = sheet.slit(*sheet.sheet(kwargs.get("nodes") or scene.nodes), CUT)[2]
     self.pairs = len(self.edges)
     kwargs = {"force_limit": 3.0, "damage": 8.0, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=self.targets), random, **kwargs)
+    super().__init__(scene, random, **kwargs)
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: a wall with a cut in a frame, and the needle with its thread."""
@@ -380,13 +378,6 @@ class Running(Stitching):
     port, aside = second.trocar(), self.random.uniform(-0.005, 0.005, 3)
     pos, turn = park(port)
     second.set_joints(wrist.inverse(port, pos + aside, turn))
-
-  def recorded(self, physics: Physics) -> dict[str, float]:
-    """Returns pull, bite, gap, tension and tears."""
-    return {
-      "traction": self.pull, "bite": self.deepest, "regrasped": self.regrasps, "gap": self.gap,
-      "tension": self.tight, "torn": self.torn,
-    }  # fmt: skip
 
   def label(self, kind: str) -> str:
     """Returns what an event of the rules is called."""

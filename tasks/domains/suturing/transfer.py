@@ -18,7 +18,6 @@ Success: all of them. Failure: a needle that nobody holds for half a second, a f
 damage limit, or the time limit.
 """
 
-import dataclasses
 import itertools
 import math
 from typing import Annotated, Any
@@ -33,10 +32,7 @@ from palpate.tissue.types import Array
 from ...core.base import Physics
 from ...core.performer import Performer, Script
 from ...core.rules import (
-  HIDDEN,
-  LATER,
   MISSED,
-  NOW,
   RUNNING,
   SUCCESS,
   Rules,
@@ -47,6 +43,7 @@ from ...core.rules import (
   needle_place,
   other_tip,
   scraped,
+  shown,
   tip,
   vector,
 )
@@ -222,8 +219,7 @@ def observe(s, o):
 
 def mark(s, o, k):
   """Marks the rings that are left, above them."""
-  look = LATER if k > o.done else HIDDEN
-  return o.middles[k] + vector(0.0, 0.0, o.size + 0.005), NOW if k == o.done else look
+  return o.middles[k] + vector(0.0, 0.0, o.size + 0.005), shown(k, o.done)
 
 
 class Transfer(Needlework):
@@ -236,6 +232,7 @@ class Transfer(Needlework):
     observe,
     ("lead", "trail", "circle", "way", "target", "through", "right_holds", "left_holds"),
     metrics={"regrasps": "regrasps", "ring_contact": "scraping", "peak_ring_force": "worst"},
+    columns={"regrasped": "regrasps", "ring_time": "scraping", "ring_force": "worst"},
     mark=mark,
   )
 
@@ -252,7 +249,7 @@ class Transfer(Needlework):
     """
     self.targets, self.size, self.tilt = rings, size, math.radians(tilt)
     kwargs = {"force_limit": 5.0, "damage": 20.0, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=rings), random, **kwargs)
+    super().__init__(scene, random, **kwargs)
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene with needle and rings."""
@@ -307,12 +304,6 @@ class Transfer(Needlework):
     self.done, self.entered, self.passed, self.through = 0, 0, False, 0.0
     self.scraping = self.worst = 0.0
     self.error0 = float(np.linalg.norm(end - self.middles[0]))
-
-  def recorded(self, physics: Physics) -> dict[str, float]:
-    """Returns how often the needle was grasped anew, and what it did to the rings."""
-    return {
-      "regrasped": self.regrasps, "ring_time": self.scraping, "ring_force": self.worst
-    }  # fmt: skip
 
   def instruct(self, physics: Physics) -> str:
     """Says what is next."""

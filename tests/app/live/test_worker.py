@@ -343,8 +343,7 @@ def test_a_frame_has_the_places_of_a_thread():
   np.testing.assert_allclose(nodes(), np.column_stack([line, np.ones(6)]), atol=1e-6)
   for k, pull in ((0, -1.0), (5, 1.0)):
     data.xfrc_applied[model.body(f"suture_{k}").id, 1] = pull  # twice what it bears
-  for _ in range(50):
-    mujoco.mj_step(model, data)
+  mujoco.mj_step(model, data, 50)
   assert thread.broken.any()
   np.testing.assert_array_equal(nodes()[:-1, 3] == 0, thread.broken)
 

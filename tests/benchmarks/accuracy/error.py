@@ -70,7 +70,7 @@ def groups(rows: list[Row]) -> dict[tuple, list[Row]]:
   """Returns the runs by (scene, nodes, elements)."""
   out: dict[tuple, list[Row]] = {}
   for row in rows:
-    if row["kind"] == "run" and row["status"] == "ok":
+    if row["kind"] == "run":
       out.setdefault((row["scene"], row["nodes"], row["elements"]), []).append(row)
   return out
 
@@ -223,10 +223,10 @@ def summarize(rows: list[Row]) -> list[str]:
   table = [[*key, *(mine[0][k] for k in told)] for key, mine in found.items()]
   head = ["scene", "nodes", "elements", "order", "moved by, position", "moved by, force"]
   lines += ["## The reference", "", *plots.table(head, table), ""]
-  ended = [r for r in rows if r["kind"] == "run" and (r["status"] != "ok" or r["finite"] == 0)]
+  ended = [r for r in rows if r["kind"] == "run" and r["finite"] == 0]
   if ended:
-    words = sorted({f"{r['case']}: {r['run'] or r['status']}" for r in ended})
-    lines += ["Diverged or not run: " + "; ".join(words), ""]
+    words = sorted({f"{r['case']}: {r['run']}" for r in ended})
+    lines += ["Diverged: " + "; ".join(words), ""]
   return lines
 
 
@@ -251,15 +251,13 @@ def finding(rows: list[Row]) -> list[str]:
   return lines
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Draws the figures and writes the page."""
-  drawn = draw(rows, out)
+  drawn = draw(rows, path.parent)
   lines = summarize(rows)
-  for path in drawn[1:]:
-    lines += [f"![Run time against error, {path.stem.removeprefix('error_')}]({path.name})", ""]
-  page = results.page(out / "error.md", "Run time against error", about, lines,
-                      finding(rows), drawn[0] if drawn else None)  # fmt: skip
-  return [*drawn, page]
+  for each in drawn[1:]:
+    lines += [f"![Run time against error, {each.stem.removeprefix('error_')}]({each.name})", ""]
+  return results.Page("Run time against error", finding(rows), lines, drawn)
 
 
 BENCH = Bench("error", stages, run, _COLUMNS, report, jobs=1, limit=3600.0)

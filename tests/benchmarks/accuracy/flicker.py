@@ -90,29 +90,28 @@ def finding(rows: list[Row]) -> list[str]:
   ]
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
-  good = [r for r in rows if r["status"] == "ok"]
-  over = [r for r in good if any(r[key] >= most for key, most in ALLOWED.items())]
+  over = [r for r in rows if any(r[key] >= most for key, most in ALLOWED.items())]
   table = []
-  for key in sorted({(r["organ"], r["nodes"], r["coupling"]) for r in good}):
-    mine = {r["h"]: r for r in good if (r["organ"], r["nodes"], r["coupling"]) == key}
+  for key in sorted({(r["organ"], r["nodes"], r["coupling"]) for r in rows}):
+    mine = {r["h"]: r for r in rows if (r["organ"], r["nodes"], r["coupling"]) == key}
     cells = [f"{mine[h]['without']:.1f} / {mine[h]['change']:.1f}" if h in mine else "-" for h in H]
     table.append([*map(str, key), *cells])
   head = ["organ", "nodes", "coupling", *(f"{1e3 * h:g} ms" for h in H)]
   lines = [str(__doc__).partition("\n\n")[2], "", *plots.table(head, table), ""]
-  lines += [f"{len(over)} of {len(good)} presses are over what is asked for."]
-  lines += ["", results.link(out / "flicker.csv")]
+  lines += [f"{len(over)} of {len(rows)} presses are over what is asked for."]
+  lines += ["", results.link(path)]
   panels: dict = {}
-  for organ, coupling in sorted({(r["organ"], r["coupling"]) for r in good}):
-    mine = [r for r in good if (r["organ"], r["coupling"]) == (organ, coupling)]
+  for organ, coupling in sorted({(r["organ"], r["coupling"]) for r in rows}):
+    mine = [r for r in rows if (r["organ"], r["coupling"]) == (organ, coupling)]
     steps = sorted({r["h"] for r in mine})
     line = [1e3 * h for h in steps], [max(r["change"] for r in mine if r["h"] == h) for h in steps]
     panels.setdefault(coupling, {})[organ] = line
   title = "Change of the force from step to step, the worst of all meshes"
-  picture = plots.curves(out / "flicker.png", title, panels, "time step [ms]", "of the mean [%]")
-  title = "Contact forces without flicker"
-  return [picture, results.page(out / "flicker.md", title, about, lines, finding(good), picture)]
+  picture = path.with_suffix(".png")
+  plots.curves(picture, title, panels, "time step [ms]", "of the mean [%]")
+  return results.Page("Contact forces without flicker", finding(rows), lines, [picture])
 
 
 BENCH = Bench("flicker", stages, run, report=report)

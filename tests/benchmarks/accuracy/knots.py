@@ -180,11 +180,10 @@ def finding(rows: list[Row]) -> list[str]:
   return lines
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
-  good = [r for r in rows if r["status"] == "ok"]
   kinds = "tangle", "pull", "edge", "stitch"
-  by = {kind: [r for r in good if r["kind"] == kind] for kind in kinds}
+  by = {kind: [r for r in rows if r["kind"] == kind] for kind in kinds}
   pulls = [
     [r["knot"], r["material"], f"{r['friction'] or '-'}", f"{r['held']:.2f}", f"{r['slip_mm']:.1f}",
      f"{r['median_ms']:.2f}", f"{r['high_ms']:.1f}"]
@@ -213,7 +212,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     f"Steps that were not solved to the end are in {unsolved} tangles, other errors in {other}. "
     f"Changed knots: {', '.join(lost) or 'none'}.",
     "",
-    results.link(out / "knots.csv"),
+    results.link(path),
   ]
   panels: dict = {
     "overhand knot": {
@@ -221,8 +220,8 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     }
   }
   title = "Thread kept in an overhand knot, by the time of a step"
-  picture = plots.curves(out / "knots.png", title, panels, "median step [ms]", "kept [mm]")
-  return [picture, results.page(out / "knots.md", "Knots", about, lines, finding(good), picture)]
+  picture = plots.curves(path.with_suffix(".png"), title, panels, "median step [ms]", "kept [mm]")
+  return results.Page("Knots", finding(rows), lines, [picture])
 
 
 BENCH = Bench("knots", stages, run, columns=_COLUMNS, report=report, jobs=4)

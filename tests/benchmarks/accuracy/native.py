@@ -132,7 +132,7 @@ def finding(rows: list[Row]) -> list[str]:
   return lines
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
   table = [
     [r["kind"], r["setting"], *([f"fails: {r['why']}", "", "", ""] if r["why"] else [
@@ -145,9 +145,9 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   names = [f"{r['kind']}: {r['setting']}" for r in held]
   title = "Settings of MuJoCo's native flex"
   picture = plots.bars(
-    out / "native.png", title, names, {"time": [r["times"] for r in held]}, f"[of {PEER}]"
+    path.with_suffix(".png"), title, names, {"time": [r["times"] for r in held]}, f"[of {PEER}]"
   )
-  return [picture, results.page(out / "native.md", title, about, lines, finding(rows), picture)]
+  return results.Page(title, finding(rows), lines, [picture])
 
 
 COLUMNS = ("kind", "setting", "nv", "times", "error", "peak", "why")

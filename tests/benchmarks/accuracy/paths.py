@@ -133,28 +133,26 @@ def arguments(parser: argparse.ArgumentParser):
 
 def finding(rows: list[Row]) -> list[str]:
   """Returns what the page begins with."""
-  good = [row for row in rows if row["status"] == "ok"]
   lines = []
   for low, high in ((0, 2000), (2000, math.inf)):
-    mine = [row for row in good if low <= float(row["nodes"]) < high]
+    mine = [row for row in rows if low <= float(row["nodes"]) < high]
     if mine:
       off = max(float(row["off_mm"]) for row in mine)
       few, many = (pick(int(row["nodes"]) for row in mine) for pick in (min, max))
       lines.append(f"Cuts of organs of {few} to {many} nodes stay within {off:.2g} mm of their "
                    "path.")  # fmt: skip
-  if good:
-    mass = max(abs(float(row["mass"])) for row in good)
+  if rows:
+    mass = max(abs(float(row["mass"])) for row in rows)
     lines.append(f"Mass changes by at most {mass:.1g} of itself, which is rounding.")
   return lines
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page: the worst of all seeds."""
   groups: dict[tuple, list[Row]] = {}
   for row in rows:
-    if row["status"] == "ok":
-      size = 10 ** round(np.log10(float(row["nodes"])) * 4)
-      groups.setdefault((row["shape"], row["curve"], size), []).append(row)
+    size = 10 ** round(np.log10(float(row["nodes"])) * 4)
+    groups.setdefault((row["shape"], row["curve"], size), []).append(row)
   table = []
   for (shape, curve, _), some in groups.items():
     most = {k: max(abs(float(row[k])) for row in some) for k in COLUMNS[4:-1]}
@@ -167,12 +165,12 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
           "volume of the wall", "enclosed"]  # fmt: skip
   lines = [*(__doc__ or "").split("\n\n", 2)[2].splitlines(), ""]
   lines += ["The worst of all cuts; mass and volumes are changes, relative. "
-            + results.link(out / "paths.csv"), "", *plots.table(head, table)]  # fmt: skip
+            + results.link(path), "", *plots.table(head, table)]  # fmt: skip
   names = [f"{line[0]}, {line[1]}, {line[2]} nodes" for line in table]
-  picture = plots.bars(out / "paths.png", "How far a cut is from its path at most", names,
+  picture = plots.bars(path.with_suffix(".png"), "How far a cut is from its path at most", names,
                        {"": [float(line[5]) for line in table]}, "[mm]")  # fmt: skip
   title = "How near cuts follow their path"
-  return [picture, results.page(out / "paths.md", title, about, lines, finding(rows), picture)]
+  return results.Page(title, finding(rows), lines, [picture])
 
 
 BENCH = Bench("paths", stages, run, COLUMNS, report, arguments)

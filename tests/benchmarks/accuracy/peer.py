@@ -363,7 +363,7 @@ def draw(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
                       "force error [% of peak]")  # fmt: skip
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
   sides: dict = {"organ, window": {"side": "window"}, "organ, nodal": {"side": "nodal"}}
   for version in sorted({r["mujoco"] for r in rows}, key=str):
@@ -392,8 +392,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   lines += [*plots.table(["tissue", "nodes", *sides], steps), ""]
   lines += ["Every setting, with its force: [peer.csv](peer.csv)."]
   title = "Run time against error beside MuJoCo's flex"
-  picture = draw(rows, out)
-  return [picture, results.page(out / "peer.md", title, about, lines, finding(rows), picture)]
+  return results.Page(title, finding(rows), lines, [draw(rows, path.parent)])
 
 
 def _least(rows: list[Row], level: float) -> Row | None:

@@ -388,13 +388,12 @@ def draw(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
   return plots.bars(out / "truth.png", title, list(errors), groups, "error [%]")
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
-  good = [r for r in rows if r["status"] == "ok"]
   lines = [str(__doc__).partition("\n\n")[2], ""]
   head = ["", "edges", "nodes", "depth [mm]", "reference", "ours", "error [%]", ""]
   for kind, most in ALLOWED.items():
-    mine = [r for r in good if r["kind"] == kind]
+    mine = [r for r in rows if r["kind"] == kind]
     mine.sort(key=lambda r: (r["what"], str(r["nodes"])))
     if not mine:
       continue
@@ -410,10 +409,9 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     lines += [*plots.table(head, table), ""]
   lines += ["## Measurements that are no rows above", ""]
   lines += [*plots.table(["source", "what it has", "why"], PUBLISHED), ""]
-  lines += [results.link(out / "truth.csv")]
+  lines += [results.link(path)]
   title = "Forces against theory, other finite elements, measurements"
-  picture = draw(good, out)
-  return [picture, results.page(out / "truth.md", title, about, lines, finding(good), picture)]
+  return results.Page(title, finding(rows), lines, [draw(rows, path.parent)])
 
 
 BENCH = Bench("truth", stages, run, columns=_COLUMNS, report=report, begin=begin)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import collections
 import math
+import pathlib
 from collections.abc import Iterator
 
 import numpy as np
@@ -80,7 +81,7 @@ def finding(rows: list[Row]) -> list[str]:
   """Returns what the page begins with."""
   lines = []
   for who in ("expert", "skilled", "novice"):
-    mine = [r for r in rows if r["status"] == "ok" and r["who"] == who]
+    mine = [r for r in rows if r["who"] == who]
     if mine:
       won = sum(r["outcome"] == score.SUCCESS for r in mine)
       lines.append(f"Of {len(mine)} episodes of {who} performers {won} succeed and "
@@ -93,12 +94,11 @@ def _share(rows: list[Row]) -> float:
   return 100 * sum(int(r["proficient"] or 0) for r in rows) / len(rows) if rows else math.nan
 
 
-def report(rows: list[Row], about: dict, out) -> list:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page: a line an exercise, and what the groups fail by."""
   groups: dict[tuple[str, str], list[Row]] = collections.defaultdict(list)
   for row in rows:
-    if row["status"] == "ok":
-      groups[row["task"], row["who"]].append(row)
+    groups[row["task"], row["who"]].append(row)
   names = list(dict.fromkeys(name for name in NAMES if any(name == task for task, _ in groups)))
   head = ["exercise"] + [f"{who}: {what}" for who in GROUPS for what in _HEAD]
   table = [
@@ -106,13 +106,13 @@ def report(rows: list[Row], about: dict, out) -> list:
     for name in names
   ]
   lines = [*(__doc__ or "").split("\n\n", 1)[1].splitlines(), ""]
-  lines += [_WHAT + results.link(out / "experts.csv"), "", *plots.table(head, table), ""]
+  lines += [_WHAT + results.link(path), "", *plots.table(head, table), ""]
   lines += ["## What they fail by", "", *plots.table(_WHY, list(_reasons(groups)))]
   title = "Experts, skilled people and novices"
-  picture = plots.bars(out / "experts.png", "Episodes that are proficient", names, {
+  picture = plots.bars(path.with_suffix(".png"), "Episodes that are proficient", names, {
     who: [_share(groups.get((name, who), [])) for name in names] for who in GROUPS
   }, "share of the episodes [%]")  # fmt: skip
-  return [picture, results.page(out / "experts.md", title, about, lines, finding(rows), picture)]
+  return results.Page(title, finding(rows), lines, [picture])
 
 
 _HEAD = ("success", "proficient", "score")

@@ -74,7 +74,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
 def trainings(rows: list[Row]) -> dict[str, list[list[Row]]]:
   """Returns the curves of each exercise, one a seed."""
   out: dict[str, dict[int, list[Row]]] = {}
-  for row in (row for row in rows if row["status"] == "ok"):
+  for row in rows:
     out.setdefault(row["task"], {}).setdefault(row["seed"], []).append(row)
   return {task: list(seeds.values()) for task, seeds in out.items()}
 
@@ -97,7 +97,7 @@ def shown(value: float, unit: str = "") -> str:
   return "-" if math.isnan(value) else f"{value:.0f}{unit}"
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Draws success over control steps, and writes the page."""
   found = trainings(rows)
   figure, axes = plots.grid(1, max(1, len(found)), 2.4 * max(1, len(found)), 2.4)
@@ -107,7 +107,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     ax.set(title=task, xlabel="million control steps", ylim=(0, 102))
   axes[0].set_ylabel("success, with noise [%]")
   title = "What is learned from nothing"
-  picture = plots.save(figure, out / "learning.png", title)
+  picture = plots.save(figure, path.with_suffix(".png"), title)
   table = [
     [task, end["seed"], shown(end["made"]), f"{end['steps'] / 1e6:.2f}", f"{end['seconds']:.0f}",
      shown(end["judged"], " %"), f"{end['success']:.0f} %"]
@@ -121,11 +121,11 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     "`success` is without noise, of an episode in each world, and at least that: counting ends at "
     f"{ENOUGH:.0f} %. `with noise` is of the last episodes of the training. `start` is what comes "
     "before learning: kernels are compiled the first time an exercise runs, and loaded after that. "
-    + results.link(out / "learning.csv"),
+    + results.link(path),
     "",
     *plots.table(head, table),
   ]
-  return [picture, results.page(out / "learning.md", title, about, lines, finding(rows), picture)]
+  return results.Page(title, finding(rows), lines, [picture])
 
 
 BENCH = Bench("learning", stages, run, report=report, arguments=arguments, jobs=1, limit=3600.0)

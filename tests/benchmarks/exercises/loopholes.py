@@ -311,74 +311,70 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return [row]
 
 
-def _extreme(rows: list[Row], task: str, key: str, pick) -> float:
-  found = [float(r[key]) for r in rows if r["task"] == task and math.isfinite(float(r[key]))]
-  return pick(found) if found else math.nan
+def _extreme(rows: list[Row], key: str, pick) -> float:
+  return pick((v for row in rows if math.isfinite(v := float(row[key]))), default=math.nan)
+
+
+def _sum(rows: list[Row], key: str) -> int:
+  return sum(int(row[key]) for row in rows)
+
+
+def _paid(rows: list[Row]) -> tuple[float, float]:
+  """Returns the most that was paid without success, and the least with it."""
+  return _extreme(rows, "most_without_success", max), _extreme(rows, "least_with_success", min)
 
 
 def finding(rows: list[Row]) -> list[str]:
   """Returns what the page begins with."""
-  tried, work, failed, above = (
-    sum(int(row[key]) for row in rows)
-    for key in ("tried", "policies_without_the_work", "failures_with_a_score", "above_expert")
-  )
-  tasks = dict.fromkeys(row["task"] for row in rows)
-  limits = ("most_without_success", max), ("least_with_success", min)
-  over = [task for task in tasks
-          if _extreme(rows, task, *limits[0]) >= _extreme(rows, task, *limits[1])]  # fmt: skip
+  by_task = {task: [r for r in rows if r["task"] == task] for task in {r["task"]: 0 for r in rows}}
+  over = [task for task, mine in by_task.items() if np.greater_equal(*_paid(mine))]
   return [
-    f"Of {tried} policies that a search tried {work} succeeded without the work.",
-    f"{failed} failures had a score, and {above} successes one above the expert's in that episode.",
-    f"Failure was paid as much as some success in {len(over)} of {len(tasks)} exercises"
+    f"Of {_sum(rows, 'tried')} policies that a search tried "
+    f"{_sum(rows, 'policies_without_the_work')} succeeded without the work.",
+    f"{_sum(rows, 'failures_with_a_score')} failures had a score, and "
+    f"{_sum(rows, 'above_expert')} successes one above the expert's in that episode.",
+    f"Failure was paid as much as some success in {len(over)} of {len(by_task)} exercises"
     f"{': ' * bool(over)}{', '.join(over)}.",
   ]
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
-  """Writes the page."""
-  rows = [row for row in rows if row["status"] == "ok"]
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
+  """Writes the page: a line an exercise and kind of policy, of all its searches."""
+  groups: dict[tuple[str, str], list[Row]] = {}
+  for row in sorted(rows, key=lambda row: (row["task"], KINDS.index(row["kind"]))):
+    groups.setdefault((row["task"], row["kind"]), []).append(row)
 
-  def number(row: Row, key: str) -> str:
-    value = float(row[key])
+  def told(value: float) -> str:
     return f"{value:.2f}" if math.isfinite(value) else "-"
 
-  numbers = ("return_seen", "return_fresh", "score_seen", "score_fresh", "score_expert")
-  limits = ("most_without_success", "least_with_success")
   table = [
     [
-      *(row[key] for key in ("task", "kind", "search", "aim", "tried")),
-      *(number(row, key) for key in numbers),
-      f"{row['above_expert']} of {row['fresh']}", row["better_in"],
-      f"{row['won_seen']} of 1", f"{row['won_fresh']} of {row['fresh']}",
-      *(number(row, key) for key in limits),
-      row["failures_with_a_score"], row["policies_without_the_work"],
+      *group, _sum(mine, "tried"), f"{_sum(mine, 'won_fresh')} of {_sum(mine, 'fresh')}",
+      told(_extreme(mine, "score_fresh", max)), told(_extreme(mine, "score_expert", min)),
+      _sum(mine, "above_expert"), " ".join(row["better_in"] for row in mine).strip(),
+      *map(told, _paid(mine)),
+      _sum(mine, "failures_with_a_score"), _sum(mine, "policies_without_the_work"),
     ]
-    for row in rows
+    for group, mine in groups.items()
   ]  # fmt: skip
   head = [
-    "exercise", "policy", "search", "against", "tried", "return, seen", "fresh", "score, seen",
-    "fresh", "the expert's", "above it", "better in", "success, seen", "fresh",
-    "most paid without success", "least with",
-    "failures with a score", "successes without the work",
+    "exercise", "policy", "tried", "success, fresh", "best score, fresh", "the expert's",
+    "above it", "better in", "most paid without success", "least with", "failures with a score",
+    "successes without the work",
   ]  # fmt: skip
-  tried = sum(int(row["tried"]) for row in rows)
-  bad = [sum(int(row[key]) for row in rows) for key in
-         ("failures_with_a_score", "policies_without_the_work")]  # fmt: skip
-  lines = [*(__doc__ or "").split("\n\n", 1)[1].splitlines(), ""]
-  lines += [
-    f"Of {tried} policies {bad[1]} succeeded without the work, and {bad[0]} failures had a score. "
-    "What is paid without success must be less than what is paid with it. "
-    + results.link(out / "loopholes.csv"),
+  lines = [
+    *(__doc__ or "").split("\n\n", 1)[1].splitlines(),
+    "What is paid without success must be less than what is paid with it. " + results.link(path),
     "",
+    *plots.table(head, table),
   ]
-  lines += plots.table(head, table)
   tasks = list(dict.fromkeys(row["task"] for row in rows))
-  title = "Loopholes of the exercises"
-  picture = plots.bars(out / "loopholes.png", "What a search was paid", tasks, {
-    "most paid without success": [_extreme(rows, task, limits[0], max) for task in tasks],
-    "least paid with success": [_extreme(rows, task, limits[1], min) for task in tasks],
+  paid = [_paid([row for row in rows if row["task"] == task]) for task in tasks]
+  without, least = zip(*paid, strict=True)
+  picture = plots.bars(path.with_suffix(".png"), "What a search was paid", tasks, {
+    "most paid without success": without, "least paid with success": least,
   }, "return")  # fmt: skip
-  return [picture, results.page(out / "loopholes.md", title, about, lines, finding(rows), picture)]
+  return results.Page("Loopholes of the exercises", finding(rows), lines, [picture])
 
 
 BENCH = Bench("loopholes", stages, run, report=report, arguments=arguments, jobs=2, limit=3600.0)

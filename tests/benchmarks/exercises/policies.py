@@ -119,14 +119,14 @@ def _counted(rows: list[Row]) -> list[Row]:
   return [row for row in rows if str(row["proficient"]) != ""]
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page: a line an exercise."""
   groups: dict[str, list[Row]] = collections.defaultdict(list)
   many: dict[str, str] = {}
   for row in rows:
-    if row["status"] == "ok" and row.get("worlds"):
+    if row.get("worlds"):
       many[row["task"]] = f"{100 * int(row['won']) / int(row['worlds']):.1f} % of {row['worlds']}"
-    elif row["status"] == "ok":
+    else:
       groups[row["task"]].append(row)
   head = ["exercise", "lessons", "training [s]", "began with", "success", "proficient",
           "time of a success [s]", "ends otherwise", "successes over a limit",
@@ -142,18 +142,17 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     f"{count} of {len(NAMES)} exercises have one; training took {np.median(times):.0f} s in "
     "the median. Proficient is by the experts' limits, of all episodes; over a limit are named the "
     "three metrics that most are over. Who began with another's policy has not counted the time of "
-    f"that one's training: with 0 lessons it is that one. {results.link(out / 'policies.csv')}",
+    f"that one's training: with 0 lessons it is that one. {results.link(path)}",
     "", *plots.table(head, table),
   ]  # fmt: skip
   judged = {name: groups[name] for name in NAMES if name in groups}
-  title = "Policies that were trained"
-  picture = plots.bars(out / "policies.png", "Policies that ship", list(judged), {
+  picture = plots.bars(path.with_suffix(".png"), "Policies that ship", list(judged), {
     "success": [_share(rows, lambda r: r["outcome"] == score.SUCCESS) for rows in judged.values()],
     "proficient": [
       _share(_counted(rows), lambda r: int(r["proficient"])) for rows in judged.values()
     ],
   }, "share of the episodes [%]")  # fmt: skip
-  return [picture, results.page(out / "policies.md", title, about, lines, finding(judged), picture)]
+  return results.Page("Policies that were trained", finding(judged), lines, [picture])
 
 
 def _line(name: str, rows: list[Row]) -> list[str]:

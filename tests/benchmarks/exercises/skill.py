@@ -26,7 +26,7 @@ STATED = {
     "starts with twice the force",
     (
       "peak_force", "mean_force", "rms_force", "force_time_product", "force_breaches",
-      "excess_impulse", "peak_pressure",
+      "excess_impulse", "peak_pressure", "peak_grip", "mean_grip",
     ),
   ),
   "detour": (
@@ -37,8 +37,12 @@ STATED = {
 # Where a novice's way does not come into play for a metric: why.
 EXCUSED = {
   (task, "force", metric): "still under the limit"
-  for task in ("touch/standard", "probe/easy", "trace/easy")
+  for task in SKILL_TASKS
   for metric in ("force_breaches", "excess_impulse")
+} | {
+  (task, "force", metric): "it grips harder, and pulls as before"
+  for task in ("grasp/easy", "retract/easy")
+  for metric in ("peak_force", "mean_force", "rms_force", "force_time_product", "peak_pressure")
 }
 LARGE = 0.8  # Cohen's d
 
@@ -68,7 +72,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return rows
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page: what each metric tells apart, and the effect sizes task by task."""
   head = [
     "Cells are Cohen's d, positive where the novice is worse; `inf` where neither group varies. "
@@ -83,8 +87,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   for task in dict.fromkeys(row["task"] for row in rows):
     lines += _task(task, [row for row in rows if row["task"] == task], told)
   lines = [*head, "", "## Metric by metric", "", *_verdicts(told), *lines]
-  title = "Metrics: expert against novices"
-  return [results.page(out / "skill.md", title, about, lines, finding(told))]
+  return results.Page("Metrics: expert against novices", finding(told), lines)
 
 
 def finding(told: dict[tuple[str, str], dict[str, float]]) -> list[str]:
@@ -100,7 +103,7 @@ def finding(told: dict[tuple[str, str], dict[str, float]]) -> list[str]:
 
 
 def _task(name: str, rows: list[Row], told: dict) -> list[str]:
-  """Returns the table of a task and adds what its metrics tell apart to `told`."""
+  """Returns a table of a task's metrics that must show, and adds what all tell apart to `told`."""
   by_style = {style: [r for r in rows if r["style"] == style] for style in performer.STYLES}
   won = {k: sum(r["outcome"] == "success" for r in mine) for k, mine in by_style.items()}
   wins = ", ".join(f"{k} {won[k]}/{len(mine)}" for k, mine in by_style.items())
@@ -122,7 +125,8 @@ def _task(name: str, rows: list[Row], told: dict) -> list[str]:
       if not why:
         told.setdefault((metric, style), {})[name] = -math.inf if d is None else d
       cells.append(text)
-    lines.append(f"| {spec.label} | {shown} | {' | '.join(cells)} |")
+    if any(metric in metrics for _, metrics in STATED.values()):
+      lines.append(f"| {spec.label} | {shown} | {' | '.join(cells)} |")
   return lines
 
 
@@ -143,7 +147,7 @@ def _verdicts(told: dict[tuple[str, str], dict[str, float]]) -> list[str]:
     ]
     if not any(found.values()):
       bad = ["not known in these tasks"]
-    elif good and not bad:
+    elif good and not bad and not any(metric == excused for *_, excused in EXCUSED):
       good = ["all"]
     cells = [", ".join(words) for words in (stated or ["no novice is made to"], good, bad, also)]
     lines.append(f"| {spec.label} | {' | '.join(cells)} |")

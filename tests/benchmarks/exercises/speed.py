@@ -199,7 +199,7 @@ def many(task: str, device: str, nworld: int) -> list[Row]:
   ]
 
 
-def compare(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def compare(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page of exercises in many worlds."""
   pairs = list(zip(rows[::2], rows[1::2], strict=True))
   times = [free["steps_per_s"] / same["steps_per_s"] for free, same in pairs]
@@ -215,15 +215,14 @@ def compare(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Pat
     f"control steps, which are run twice. Times are medians of {TURNS} stretches of "
     f"{STEPS // 5} control steps, of both in turn. "
   )
-  lines = [text + results.link(out / "exercises_cuda.csv"), "", *plots.table(head, table)]
+  lines = [text + results.link(path), "", *plots.table(head, table)]
   found = [
     f"Runs that repeat take {min(times):.2f} to {max(times):.2f} times as long.",
     f"Of their worlds {sum(same['differ'] for _, same in pairs)} differ between two runs; without "
     f"`deterministic=True` {sum(free['differ'] for free, _ in pairs)} of "
     f"{sum(free['nworld'] for free, _ in pairs)} do.",
   ]
-  title = "How fast exercises run in many worlds"
-  return [results.page(out / "exercises_cuda.md", title, about, lines, found)]
+  return results.Page("How fast exercises run in many worlds", found, lines, name="exercises_cuda")
 
 
 def finding(rows: list[Row]) -> list[str]:
@@ -240,10 +239,10 @@ def finding(rows: list[Row]) -> list[str]:
   ]
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
   if rows and "repeat" in rows[0]:
-    return compare(rows, about, out)
+    return compare(rows, path)
   raced = all(row["times"] for row in rows)
   table = [
     [r["task"], r["nodes"], f"{r['steps_per_s']:.0f}", f"{r['metrics_percent']:.1f} %"]
@@ -262,12 +261,13 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
       "stretches of 10 control steps in turn: `--against` the Python of a venv that has that "
       "commit. "
     )
-  lines = [text + results.link(out / "exercises_cpu.csv"), "", *plots.table(head, table)]
-  title = "How fast the exercises run"
+  lines = [text + results.link(path), "", *plots.table(head, table)]
   rates = {"": [r["steps_per_s"] for r in rows]}
   names = [r["task"] for r in rows]
-  picture = plots.bars(out / "exercises.png", title, names, rates, "control steps a second")
-  return [picture, results.page(out / "exercises.md", title, about, lines, finding(rows), picture)]
+  title = "How fast the exercises run"
+  picture = path.with_name("exercises.png")
+  plots.bars(picture, title, names, rates, "control steps a second")
+  return results.Page(title, finding(rows), lines, [picture], "exercises")
 
 
 BENCH = Bench("speed", stages, run, report=report, arguments=arguments, file="exercises_{device}")

@@ -319,12 +319,10 @@ def finding(out: pathlib.Path) -> list[str]:
   return lines[-3:]
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page, of all devices that there are results of."""
-  title, lines = "How many worlds a batch steps a second", table(out)
-  picture = draw(out)
-  lines += ["", *PUBLISHED]
-  return [picture, results.page(out / "batch.md", title, about, lines, finding(out), picture)]
+  out, title = path.parent, "How many worlds a batch steps a second"
+  return results.Page(title, finding(out), [*table(out), "", *PUBLISHED], [draw(out)])
 
 
 BENCH = Bench("batch", stages, run, report=report, arguments=arguments, file="batch_{device}")

@@ -213,7 +213,7 @@ def finding(rows: list[Row]) -> list[str]:
   """Returns what the page begins with."""
   lines = []
   for name, tissues in (("sheets", ("membrane", "plate")), ("solids", ("solid",))):
-    mine = [r for r in rows if r["status"] == "ok" and r["tissue"] in tissues]
+    mine = [r for r in rows if r["tissue"] in tissues]
     if mine:
       some = [r["cut_ms"] for r in mine]
       most = max(mine, key=lambda r: r["ratio"])
@@ -227,14 +227,13 @@ def finding(rows: list[Row]) -> list[str]:
 
 def draw(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
   """Draws a step in contact, one that cuts, and the cut alone."""
-  good = [r for r in rows if r["status"] == "ok"]
-  names = [f"{r['nodes']} nodes, {r['tissue']}, {r['tool']}" for r in good]
+  names = [f"{r['nodes']} nodes, {r['tissue']}, {r['tool']}" for r in rows]
   keys = {"step in contact": "contact_ms", "step that cuts": "open_ms", "cut alone": "cut_ms"}
-  groups = {label: [r[key] for r in good] for label, key in keys.items()}
+  groups = {label: [r[key] for r in rows] for label, key in keys.items()}
   return plots.bars(out / "cut.png", "What cutting costs a step", names, groups, "CPU time [ms]")
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
   names = ("contact", "moving", "between", "mean", "cut", "open", "open_most")
   table = [
@@ -249,7 +248,6 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
       f"{row['room_ratio']:.3f}",
     ]
     for row in rows
-    if row["status"] == "ok"
   ]
   head = ["nodes", "tool", "tissue", "cuts", "in contact", "moving", "tool in it", "mean",
           "cut alone", "step that cuts", "95 % of these", "to one in contact", "to one moving",
@@ -259,15 +257,11 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     "still (in contact) or moves on, with a tool in it that cuts nothing just then, the mean of "
     "all steps while it cuts, what a cut of two edges adds, a step with such a cut, 95 % of these, "
     "and that to a step in contact, and to one in which the ball moves; last: in contact, with "
-    "room for cuts to without. " + results.link(out / "cut.csv"),
+    "room for cuts to without. " + results.link(path),
     "",
     *plots.table(head, table),
   ]
-  picture = draw(rows, out)
-  page = results.page(
-    out / "cut.md", "What cutting costs a step", about, lines, finding(rows), picture
-  )
-  return [picture, page]
+  return results.Page("What cutting costs a step", finding(rows), lines, [draw(rows, path.parent)])
 
 
 BENCH = Bench("cut", stages, run, report=report, arguments=arguments)

@@ -260,22 +260,21 @@ def draw(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
   return plots.curves(out / "flex.png", title, panels, "force error [%]", "simulated s a second")
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
-  done = [row for row in rows if row["status"] == "ok"]
   order = ("kind", "nworld", "side", "h", "tolerance")
   table = [
     [row["kind"], row["nworld"], row["side"].replace("flex", "mujoco_warp's flex"),
      f"{1e3 * row['h']:g}", f"{row['tolerance']:g}", f"{row['step_ms']:.3g}", f"{row['rate']:.3g}",
      f"{row['rate'] * row['h']:.3g}", f"{100 * row['error']:.2g}", f"{row['force_N']:.3g}",
      f"{row['world_kB']:.0f}" if row["world_kB"] > 0 else "-"]
-    for row in sorted(done, key=lambda row: [row[key] for key in order])
+    for row in sorted(rows, key=lambda row: [row[key] for key in order])
   ]  # fmt: skip
   head = ["kind", "worlds", "side", "h [ms]", "tolerance", "step [ms]", "world-steps/s",
           "simulated s/s", "error [%]", "force [N]", "a world [kB]"]  # fmt: skip
   lines = [str(__doc__).split("\n\n", 2)[2], "", *plots.table(head, table), ""]
-  for kind, count in sorted({(row["kind"], row["nworld"]) for row in done}):
-    here = [row for row in done if (row["kind"], row["nworld"]) == (kind, count)]
+  for kind, count in sorted({(row["kind"], row["nworld"]) for row in rows}):
+    here = [row for row in rows if (row["kind"], row["nworld"]) == (kind, count)]
     for level in LEVELS:
       fastest = [
         max((r["rate"] * r["h"] for r in here if r["side"] == side and r["error"] <= level),
@@ -285,14 +284,9 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
       if all(fastest):
         lines.append(f"{kind}, {count} worlds, error up to {100 * level:g} %: ours simulates "
                      f"{fastest[0] / fastest[1]:.3g} times as much time a second.\n")  # fmt: skip
-  lines += [*batch.PUBLISHED, "", results.link(out / f"flex_{_kind(about)}.csv")]
-  picture = draw(done, out)
+  lines += [*batch.PUBLISHED, "", results.link(path)]
   title = "Batches beside mujoco_warp's flex"
-  return [picture, results.page(out / "flex.md", title, about, lines, finding(done), picture)]
-
-
-def _kind(about: dict) -> str:
-  return str(about.get("options", {}).get("device", "cpu")).partition(":")[0]
+  return results.Page(title, finding(rows), lines, [draw(rows, path.parent)])
 
 
 BENCH = Bench("flex", stages, run, _COLUMNS, report, arguments, file="flex_{device}")

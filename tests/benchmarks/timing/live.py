@@ -299,10 +299,9 @@ def finding(rows: list[Row]) -> list[str]:
   return [*lines, *(f"The loop costs {us:.0f} us a step beside physics." for us in cost)][:3]
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Draws the figure and writes the page."""
-  good = [r for r in rows if r["status"] == "ok"]
-  paced = sorted((r for r in good if r["late"] != ""), key=lambda row: KINDS.index(row["kind"]))
+  paced = sorted((r for r in rows if r["late"] != ""), key=lambda row: KINDS.index(row["kind"]))
   head = ["", "load", "steps", "on time", "median", "99 %", "worst", "work"]
   head += ["pictures a second", "script", "hand to picture", "95 %"]
   table = []
@@ -315,10 +314,10 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
       seen = f"{r['pictures']:.1f}", script, f"{r['way_ms']:.0f} ms", f"{r['way_95_ms']:.0f} ms"
     table.append([*line, f"{r['work_us']:.0f} us", *seen])
   lines = [str(__doc__).partition("\n\n")[2], "", *plots.table(head, table), ""]
-  for r in good:
+  for r in rows:
     if r["kind"] == "beside":
       lines += [f"The loop costs {r['beside_us']:.1f} us a step beside physics.", ""]
-  meshes = {(r["mesh"], r["scheme"]): r for r in good if r["kind"] == "mesh"}
+  meshes = {(r["mesh"], r["scheme"]): r for r in rows if r["kind"] == "mesh"}
   cells = []
   for side in sorted({side for side, _ in meshes}):
     mine = [meshes.get((side, scheme)) for scheme in SCHEMES]
@@ -329,11 +328,8 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   lines += [*plots.table(["mesh", "nodes", "made ready in", *SCHEMES], cells), ""]
   wanted = f"{100 * ON_TIME} % on time, {PICTURES} pictures a second on a laptop's graphics card"
   lines += [f"Asked for: {wanted}, {1e3 * WAY:.0f} ms, {1e6 * BESIDE:.0f} us.", ""]
-  lines += [results.link(out / "live.csv")]
-  drawn = draw(good, out)
-  picture = drawn[0] if drawn else None
-  page = results.page(out / "live.md", "A live loop", about, lines, finding(good), picture)
-  return [*drawn, page]
+  lines += [results.link(path)]
+  return results.Page("A live loop", finding(rows), lines, draw(rows, path.parent))
 
 
 def _rate(row: Row | None) -> str:

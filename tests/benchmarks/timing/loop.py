@@ -373,11 +373,10 @@ def draw(out: pathlib.Path) -> pathlib.Path:
   return plots.curves(out / "loop.png", title, panels, "nodes", "steps a second")
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page, of all devices that there are results of."""
-  title = "What a step costs, and where the time goes"
-  picture = draw(out)
-  return [picture, results.page(out / "loop.md", title, about, table(out), finding(out), picture)]
+  out, title = path.parent, "What a step costs, and where the time goes"
+  return results.Page(title, finding(out), table(out), [draw(out)])
 
 
 BENCH = Bench("loop", stages, run, report=report, arguments=arguments, file="loop{solid}_{device}")

@@ -258,7 +258,7 @@ def finding(rows: list[Row]) -> list[str]:
   return [f"{line}." for line in lines if line]
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
   head = ["what", "exercise", "drawn by", "worlds", "size", "a second", "a world takes"]
   lines = plots.table(
@@ -273,8 +273,8 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   shown = [r for r in rows if r["kind"] in ("camera", "mujoco_warp")]
   names = [f"{r['kind']} {r['task']} {r['size']}" for r in shown]
   rates = {"": [r["rate"] for r in shown]}
-  picture = plots.bars(out / "pictures.png", title, names, rates, "pictures a second")
-  return [picture, results.page(out / "pictures.md", title, about, lines, finding(rows), picture)]
+  picture = plots.bars(path.with_suffix(".png"), title, names, rates, "pictures a second")
+  return results.Page(title, finding(rows), lines, [picture])
 
 
 BENCH = Bench("pictures", stages, run, report=report, arguments=arguments, file="pictures")

@@ -137,7 +137,7 @@ def _picture(variant: _Variant) -> float | None:
 
 def draw(rows: list[Row], out: pathlib.Path) -> list[pathlib.Path]:
   """Draws the saved share of each feature."""
-  rows = [row for row in rows if row["status"] == "ok" and row["feature"] != "nothing"]
+  rows = [row for row in rows if row["feature"] != "nothing"]
   if not rows:
     return []
   features = list(dict.fromkeys(row["feature"] for row in rows))
@@ -170,7 +170,6 @@ def summarize(rows: list[Row]) -> list[str]:
     [r["nodes"], r["feature"], r["with_ms"], r["without_ms"], r["saved_ms"],
      f"{100 * r['share']:.0f} %", r["iterations"]]
     for r in rows
-    if r["status"] == "ok"
   ]  # fmt: skip
   head = ["nodes", "left out", "with [ms]", "without [ms]", "saved [ms]", "share", "iterations"]
   lines += [*plots.table(head, table), ""]
@@ -184,7 +183,7 @@ def summarize(rows: list[Row]) -> list[str]:
 
 def finding(rows: list[Row]) -> list[str]:
   """Returns what the page begins with: the three features that save most, whatever the size."""
-  good = [r for r in rows if r["status"] == "ok" and r["feature"] != "nothing"]
+  good = [r for r in rows if r["feature"] != "nothing"]
   shares = {name: [100 * r["share"] for r in good if r["feature"] == name]
             for name in dict.fromkeys(r["feature"] for r in good)}  # fmt: skip
   most = sorted(shares, key=lambda name: -max(shares[name]))[:3]
@@ -194,12 +193,10 @@ def finding(rows: list[Row]) -> list[str]:
   ]
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Draws the figures and writes the page."""
-  drawn = draw(rows, out)
-  page = results.page(out / "skipping.md", "What each feature costs", about, summarize(rows),
-                      finding(rows), drawn[0] if drawn else None)  # fmt: skip
-  return [*drawn, page]
+  drawn = draw(rows, path.parent)
+  return results.Page("What each feature costs", finding(rows), summarize(rows), drawn)
 
 
 BENCH = Bench("skipping", stages, run, _COLUMNS, report, jobs=1, limit=1800.0)

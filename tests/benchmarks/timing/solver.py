@@ -204,9 +204,8 @@ def draw(rows: list[Row], path: pathlib.Path) -> pathlib.Path:
   return plots.curves(path, "The organ's step alone", panels, "nodes", "step [ms]")
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
-  """Writes the page, of the device that there are results of."""
-  path = out / f"solver_{str(rows[0]['device']).partition(':')[0]}.csv"
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
+  """Writes the page."""
   lines = [
     "A sphere of 5 cm pressed over 6 mm, E = 30 kPa, t = 2 mm, 0.1 kg, h = 1 ms, from a cold "
     "start; medians of graph replays. A star marks the preconditioner that the plugin takes by "
@@ -222,10 +221,9 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
                   count, row["bytes_a_node"]])  # fmt: skip
   head = ["nodes", "bending", "tolerance", "preconditioner", "chosen", "step", "assemble", "solve"]
   lines += plots.table([*head, "iterations", "bytes a node"], table)
-  name = "solver.md" if path.stem == "solver_cuda" else f"{path.stem}.md"
-  picture = draw(rows, (out / name).with_suffix(".png"))
-  page = results.page(out / name, "The organ's step alone", about, lines, finding(rows), picture)
-  return [picture, page]
+  name = path.stem.removesuffix("_cuda")
+  pictures = [draw(rows, path.with_name(f"{name}.png"))]
+  return results.Page("The organ's step alone", finding(rows), lines, pictures, name)
 
 
 BENCH = Bench("solver", stages, run, report=report, arguments=arguments,

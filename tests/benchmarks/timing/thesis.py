@@ -314,7 +314,6 @@ def summarize(rows: list[Row], conditions: str = "") -> list[str]:
     *_tables(rates, {(r["scheme"], r["device"], r["side"]) for r in rows if r["diverged"]}),
     *_headline(rates),
     *_speedup(rates),
-    *_beside_loop(rates),
   ]
   held = [r for r in traces if 300 <= r["cycle"] < 500 and not r["diverged"]]
   gone = sum(abs(r["force_N"]) < 1e-3 for r in held)
@@ -429,28 +428,6 @@ def _headline(rates: dict[tuple, Row]) -> list[str]:
   ]  # fmt: skip
 
 
-def _beside_loop(rates: dict[tuple, Row]) -> list[str]:
-  """Returns why a step takes longer here than in `loop.md` at the same size."""
-  path, run = results.FOLDER / "loop_cuda.csv", ("implicit", "cuda", 128)
-  if run not in rates or not path.exists():
-    return []
-  mine = rates[run]
-  side = scene.window_side(scene.shape("octa", mine["side"] ** 2))
-  other = next(r for r in results.read(path) if r["nodes"] == mine["nodes"] and r["condim"] == 3)
-  return [
-    "",
-    f"At {mine['nodes']} nodes [loop](loop.md) steps at {other['rate_Hz']:.0f} Hz and this page at "
-    f"{mine['rate_hz']:.0f}. The motion stays on the device in both, and the device is not what "
-    f"differs: the integration here takes {mine['step_ms']:.2g} of {mine['cycle_ms']:.2g} ms, in "
-    f"{mine['iterations']:.2g} iterations for {other['iterations']:.2g} there. MuJoCo's contacts "
-    f"differ. Here a tip of {1e3 * TIP:g} mm is {1e3 * DEPTH:g} mm deep in springs, with "
-    f"{mine['contacts']} contacts at most, of {side * side} slots; there a tip of "
-    f"{1e3 * other['tip_m']:g} mm is 1.5 mm deep in a shell, with {other['contacts']} "
-    f"contacts, of {other['slots']} slots. This page gives the mean over whole presses, that one "
-    "the median of steps in contact.",
-  ]
-
-
 def conditions(out: pathlib.Path) -> str:
   """Returns how many runs shared the machine; a single one had its card and cores to itself."""
   words = []
@@ -487,14 +464,12 @@ def finding(rows: list[Row]) -> list[str]:
   return lines
 
 
-def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Draws the figures and writes the page, of all devices that there are results of."""
+  out, title = path.parent, "The tables of the thesis, measured today"
   rows = [r for path in sorted(out.glob("thesis_c*.csv")) for r in results.read(path)
           if r["status"] == "ok"]  # fmt: skip
-  drawn = draw(rows, out)
-  page = results.page(out / "thesis.md", "The tables of the thesis, measured today", about,
-                      summarize(rows, conditions(out)), finding(rows), drawn[0])  # fmt: skip
-  return [*drawn, page]
+  return results.Page(title, finding(rows), summarize(rows, conditions(out)), draw(rows, out))
 
 
 BENCH = Bench(

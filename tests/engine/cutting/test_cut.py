@@ -182,27 +182,20 @@ def test_state_copy_and_reset_have_the_cuts_to_the_bit(windows):
   run(model, data, 30, -0.03)
   organ.cut(cap())
   run(model, data, 10, -0.03)
-  saved, other = scenes.state(model, data), copy.copy(data)
-  run(model, data, 15, -0.02)
-  goal = organ.xpos, scenes.state(model, data)
-  # A copy goes on alike, in turns with data that was never cut.
-  third = mujoco.MjData(model)
-  for _ in range(15):
-    run(model, other, 1, -0.02)
-    run(model, third, 1, -0.02)
-  assert np.array_equal(scenes.state(model, other), goal[1])
-  assert handle(model, third).nvert == len(sphere()[0])
-  # So does the state, in this data after a reset, and in another.
-  mujoco.mj_resetData(model, data)
-  assert organ.nvert == len(sphere()[0]) and len(organ.pieces) == 1 and organ.cuts == ()
-  for each in (data, third):
-    mujoco.mj_setState(model, each, saved, FULL)
-    run(model, each, 15, -0.02)
-    assert np.array_equal(scenes.state(model, each), goal[1])
-    assert np.array_equal(handle(model, each).xpos, goal[0])
+  whole = mujoco.MjData(model)
+
+  def on(each):  # in turns with data that was never cut
+    for _ in range(15):
+      run(model, each, 1, -0.02)
+      run(model, whole, 1, -0.02)
+    return np.append(scenes.state(model, each), handle(model, each).xpos)
+
+  scenes.goes_on(model, data, on)
+  assert handle(model, whole).nvert == len(sphere()[0])
   # A healed organ moves as one that was never cut.
   fresh = mujoco.MjData(model)
   mujoco.mj_resetData(model, data)
+  assert organ.nvert == len(sphere()[0]) and len(organ.pieces) == 1 and organ.cuts == ()
   for each in (data, fresh):
     run(model, each, 20, -0.03)
   assert np.array_equal(scenes.state(model, data), scenes.state(model, fresh))
@@ -264,8 +257,7 @@ def test_a_scene_is_drawn_with_the_triangles_of_its_data():
   seen = []
   for each in (data, other, data):
     mujoco.mj_forward(model, each)
-    arguments = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
-    mujoco.mjv_updateScene(model, each, *arguments, mujoco.mjtCatBit.mjCAT_ALL.value, drawn)
+    scenes.draw(model, each, drawn)
     organ = handle(model, each)
     seen.append(model.flex_elem.reshape(-1, 3)[-len(organ.elem) :].copy())  # lips come before
     assert np.array_equal(seen[-1], organ.elem)
@@ -469,7 +461,6 @@ def test_a_declared_spare_without_vertices_is_refused():
 def test_the_lips_are_drawn_and_hidden_between_pictures(windows):
   model, data = scene(strip(), windows, tool=windows)
   organ, drawn = handle(model, data), mujoco.MjvScene(model, 4000)
-  arguments = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
   flex = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, "organ_inside")
   first, last = np.append(model.flex_elemdataadr, model.nflexelemdata)[flex : flex + 2]
   start, line = model.flex_vertadr[flex], np.array([[0.03, 0.0, 0.0], [0.09, 0.0, 0.0]])
@@ -479,7 +470,7 @@ def test_the_lips_are_drawn_and_hidden_between_pictures(windows):
     if cuts == 2:
       mujoco.mj_resetData(model, data)
     mujoco.mj_forward(model, data)
-    mujoco.mjv_updateScene(model, data, *arguments, mujoco.mjtCatBit.mjCAT_ALL.value, drawn)
+    scenes.draw(model, data, drawn)
     elem = model.flex_elem[first:last].reshape(-1, 3)
     elem = elem[elem.any(axis=1)]
     if cuts == 1:  # one band around the cut, from the outer side to the inner one

@@ -1,7 +1,5 @@
 """Cutting solids in a scene: state, pieces, walls that tools touch, both couplings."""
 
-import copy
-
 import mujoco
 import numpy as np
 import palpate
@@ -72,22 +70,16 @@ def test_state_copy_and_reset_have_the_cuts_to_the_bit(windows):
   organ.cut(across(0.004), depth=0.02)
   run(model, data, 5, -0.03)
   organ.cut(across(-0.01))
-  saved, other, nvert = scenes.state(model, data), copy.copy(data), organ.nvert
-  run(model, data, 10, -0.03)
-  goal = organ.xpos, scenes.state(model, data)
-  run(model, other, 10, -0.03)
-  assert np.array_equal(scenes.state(model, other), goal[1])
-  mujoco.mj_resetData(model, data)
-  assert organ.nvert == len(block()[0]) and len(organ.pieces) == 1 and organ.cuts == ()
-  third = mujoco.MjData(model)
-  for each in (data, third):
-    mujoco.mj_setState(model, each, saved, FULL)
+  saved = scenes.state(model, data)
+
+  def on(each):
     run(model, each, 10, -0.03)
-    assert np.array_equal(scenes.state(model, each), goal[1])
-    handle = palpate.Organ(model, each, "organ")
-    assert np.array_equal(handle.xpos, goal[0]) and handle.nvert == nvert
+    return np.append(scenes.state(model, each), palpate.Organ(model, each, "organ").xpos)
+
+  scenes.goes_on(model, data, on)
   fresh = mujoco.MjData(model)
   mujoco.mj_resetData(model, data)
+  assert organ.nvert == len(block()[0]) and len(organ.pieces) == 1 and organ.cuts == ()
   for each in (data, fresh):
     run(model, each, 10, -0.03)
   assert np.array_equal(scenes.state(model, data), scenes.state(model, fresh))
@@ -180,9 +172,7 @@ def test_what_holds_a_solid_goes_on_to_hold_both_sides(windows):
 def test_the_walls_are_drawn_and_hidden_between_pictures(windows):
   model, data, organ = scene(windows=windows)
   drawn = mujoco.MjvScene(model, 4000)
-  arguments = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
   flex = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, "organ_inside")
-  faces = mujoco.mjtCatBit.mjCAT_ALL.value
   first, last = np.append(model.flex_elemdataadr, model.nflexelemdata)[flex : flex + 2]
   for act in range(3):
     if act == 1:
@@ -190,7 +180,7 @@ def test_the_walls_are_drawn_and_hidden_between_pictures(windows):
     if act == 2:
       mujoco.mj_resetData(model, data)
     mujoco.mj_forward(model, data)
-    mujoco.mjv_updateScene(model, data, *arguments, faces, drawn)
+    scenes.draw(model, data, drawn)
     elem = model.flex_elem[first:last].reshape(-1, 3)
     wall = organ.elem[len(block()[1]) :]
     assert np.array_equal(elem[: len(wall)], wall) and bool(len(wall)) == (act == 1)

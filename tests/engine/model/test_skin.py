@@ -6,6 +6,7 @@ import palpate
 import pytest
 from palpate.models.meshing import grid
 from palpate.tissue.geometry import subdivide
+from scenes import draw
 
 RADIUS = 0.03
 
@@ -29,8 +30,7 @@ def scene(windows=False, skin=True, **options):
 def drawn(m, d) -> np.ndarray:
   """Returns the skin's vertices as renderers get them."""
   scn = mujoco.MjvScene(m, 100)
-  everything = mujoco.mjtCatBit.mjCAT_ALL
-  mujoco.mjv_updateScene(m, d, mujoco.MjvOption(), None, mujoco.MjvCamera(), everything, scn)
+  draw(m, d, scn)
   return np.array(scn.skinvert).reshape(-1, 3)[: m.nskinvert].astype(float)
 
 

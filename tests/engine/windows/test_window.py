@@ -9,7 +9,7 @@ import numpy as np
 import palpate
 import pytest
 from palpate.engine import coupling, layout
-from scenes import RADIUS, drive, goes_on, load, lump, organ, probed, sphere, windowed, world
+from scenes import RADIUS, draw, drive, goes_on, load, lump, organ, probed, sphere, windowed, world
 
 
 # With friction the tip sticks on the facets and jumps off them from 0.18 s on, in a 20 us reference
@@ -36,8 +36,7 @@ def test_static_force_does_not_depend_on_the_step():
     m = mujoco.MjModel.from_xml_string(probed(h=h))
     d = mujoco.MjData(m)
     d.ctrl[0] = -0.006
-    for _ in range(round(0.8 / h)):
-      mujoco.mj_step(m, d)
+    mujoco.mj_step(m, d, round(0.8 / h))
     forces.append(d.qfrc_constraint[-2])
   np.testing.assert_allclose(forces, forces[0], rtol=1e-3)
 
@@ -119,12 +118,10 @@ def test_rotated_frame_gives_the_same_force():
 def test_far_tool_leaves_the_organ_at_rest_and_finds_it_after_a_jump():
   m, d, organ = load(probed())
   d.qpos[-2] = d.ctrl[0] = 0.5
-  for _ in range(20):
-    mujoco.mj_step(m, d)
+  mujoco.mj_step(m, d, 20)
   assert np.abs(organ.displacement).max() < 1e-9
   d.qpos[-2], d.ctrl[0] = 0.0, -0.005
-  for _ in range(300):
-    mujoco.mj_step(m, d)
+  mujoco.mj_step(m, d, 300)
   assert d.qfrc_constraint[-2] > 0.01
   assert organ.force[2] == pytest.approx(-d.qfrc_constraint[-2], rel=1e-6)
 
@@ -135,9 +132,7 @@ def test_deformed_surface_reaches_the_renderer():
   drive(m, d, 110)
   organ = palpate.Organ(m, d, "organ")
   scn = mujoco.MjvScene(m, 1000)
-  mujoco.mjv_updateScene(
-    m, d, mujoco.MjvOption(), None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL, scn
-  )
+  draw(m, d, scn)
   flex = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_FLEX, "organ")
   start = m.flex_vertadr[flex]
   drawn = d.flexvert_xpos[start : start + organ.nvert]

@@ -133,18 +133,15 @@ def test_a_teleporting_tool(target):
   """The tool jumps away, far into the organ, or out at the other side, and back."""
   m, d, organ = load(probed())
   d.ctrl[0] = -0.006
-  for _ in range(100):
-    mujoco.mj_step(m, d)
+  mujoco.mj_step(m, d, 100)
   d.qpos[-2:] = d.ctrl[:] = target[1], target[0]
-  for _ in range(150):
-    mujoco.mj_step(m, d)
+  mujoco.mj_step(m, d, 150)
   assert organ.error is None and np.isfinite(organ.displacement).all()
   assert d.warning.number[mujoco.mjtWarning.mjWARN_BADQACC] == 0
   assert np.abs(organ.displacement).max() < 0.02
   d.qpos[-2:], d.qvel[-2:] = 0, 0
   d.ctrl[:] = -0.006, 0
-  for _ in range(600):
-    mujoco.mj_step(m, d)
+  mujoco.mj_step(m, d, 600)
   still = load(probed())
   still[1].ctrl[0] = -0.006
   for _ in range(850):
@@ -156,8 +153,7 @@ def test_a_teleporting_tool(target):
 def test_a_jump_into_the_middle_lets_the_tool_out_without_an_explosion():
   m, d, organ = load(probed())
   d.qpos[-2] = d.ctrl[0] = -0.05
-  for _ in range(200):
-    mujoco.mj_step(m, d)
+  mujoco.mj_step(m, d, 200)
   assert organ.error is None and np.abs(organ.displacement).max() < 0.05
   assert d.warning.number[mujoco.mjtWarning.mjWARN_BADQACC] == 0
 

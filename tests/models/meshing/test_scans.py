@@ -4,7 +4,9 @@ import pathlib
 import re
 
 import numpy as np
+import oblique
 import pytest
+from oblique import CENTER
 from palpate.models.meshing import volume as volumes
 from palpate.models.meshing.quality import quality
 from palpate.models.meshing.quality import volume as enclosed
@@ -13,31 +15,19 @@ nibabel = pytest.importorskip("nibabel")
 nrrd = pytest.importorskip("nrrd")
 pydicom = pytest.importorskip("pydicom")
 
-CENTER = np.array([0.012, -0.034, 0.051])  # [m], RAS
 SHAPES = {"sphere": (0.03, 0.03, 0.03), "ellipsoid": (0.036, 0.022, 0.028)}  # radii [m]
 SIZE = (56, 60, 52)
 INSIDE, OUTSIDE, NOISE = 60.0, -80.0, 15.0  # [HU]; fat around an organ
 
 
-def rotation(degrees=25.0):
-  """Returns a rotation about a skew axis."""
-  axis = np.array([1.0, 2.0, -1.0]) / np.sqrt(6)
-  a, cross = np.radians(degrees), np.cross(np.eye(3), axis)
-  return np.eye(3) + np.sin(a) * cross + (1 - np.cos(a)) * cross @ cross
-
-
 def affine(spacing=(1.4e-3, 1.3e-3, 1.8e-3), turn=None):
   """Returns the map from indices to metres of an oblique grid with the organ in its middle."""
-  out = np.eye(4)
-  out[:3, :3] = (rotation() if turn is None else turn) @ np.diag(spacing)
-  out[:3, 3] = CENTER - out[:3, :3] @ (np.array(SIZE) / 2.1)
-  return out
+  return oblique.affine(spacing, oblique.rotation(25) if turn is None else turn, SIZE)
 
 
 def scan(shape, grid, other=True):
   """Returns the scan of an organ in fat [HU], with noise, and a smaller part of its own."""
-  index = np.stack(np.meshgrid(*map(np.arange, SIZE), indexing="ij"), axis=-1)
-  world = index @ grid[:3, :3].T + grid[:3, 3] - CENTER
+  world = oblique.places(grid, SIZE)
   radii = np.array(SHAPES[shape])
   away = (np.sqrt(((world / radii) ** 2).sum(axis=-1)) - 1) * radii.min()  # [m], to first order
   # A voxel's value is the mean over it: the edge is as wide as a voxel.
@@ -103,13 +93,6 @@ def save_dicom(path, values, grid):
 SAVE = {"scan.nii.gz": save_nifti, "scan.nrrd": save_nrrd, "series": save_dicom}
 
 
-def moments(vertices, triangles):
-  """Returns the centroid of the solid inside a surface."""
-  corner = vertices[triangles] - CENTER
-  share = (corner[:, 0] * np.cross(corner[:, 1], corner[:, 2])).sum(axis=1) / 6
-  return CENTER + share @ corner.sum(axis=1) / 4 / share.sum()
-
-
 @pytest.mark.parametrize("name", SAVE)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_scan_becomes_the_organ_in_it(shape, name, tmp_path):
@@ -121,7 +104,7 @@ def test_a_scan_becomes_the_organ_in_it(shape, name, tmp_path):
   assert quality(*surface).closed
   radii = np.array(SHAPES[shape])
   assert enclosed(*surface) == pytest.approx(4 / 3 * np.pi * radii.prod(), rel=0.02)
-  assert np.linalg.norm(moments(*surface) - CENTER) < 1.3e-3  # a voxel
+  assert np.linalg.norm(oblique.centroid(*surface) - CENTER) < 1.3e-3  # a voxel
   np.testing.assert_allclose(np.ptp(surface[0], axis=0), 2 * radii, atol=2e-3)  # upright again
 
 
@@ -132,7 +115,7 @@ def test_the_three_kinds_say_the_same_and_the_largest_part_is_taken(tmp_path):
     save(tmp_path / name, scan("ellipsoid", grid), grid)
     vertices, triangles, report = volumes.wrap_volume(tmp_path / name, 500, threshold=-10)
     assert report.losses == () and report.pieces == 1 and report.nodes == 500
-    found.append((quality(vertices, triangles).volume, moments(vertices, triangles)))
+    found.append((quality(vertices, triangles).volume, oblique.centroid(vertices, triangles)))
   radii = np.array(SHAPES["ellipsoid"])
   # 500 nodes cut 1 % off, smoothing up to 3 % more, as of label maps.
   assert found[0][0] == pytest.approx(4 / 3 * np.pi * radii.prod(), rel=0.04)

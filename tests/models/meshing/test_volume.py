@@ -1,7 +1,9 @@
 import gzip
 
 import numpy as np
+import oblique
 import pytest
+from oblique import CENTER
 from palpate.models.meshing import volume as volumes
 from palpate.models.meshing.quality import normals, quality
 from palpate.models.meshing.quality import volume as enclosed
@@ -9,59 +11,35 @@ from palpate.models.meshing.quality import volume as enclosed
 nibabel = pytest.importorskip("nibabel")
 nrrd = pytest.importorskip("nrrd")
 
-CENTER = np.array([0.012, -0.034, 0.051])  # [m]
+SHAPE = (64, 60, 56)
 RADII = np.array([0.030, 0.022, 0.026])  # [m]
 
 
-def rotation(degrees=35.0):
-  """Returns a rotation about a skew axis."""
-  axis = np.array([1.0, 2.0, -1.0]) / np.sqrt(6)
-  a, cross = np.radians(degrees), np.cross(np.eye(3), axis)
-  return np.eye(3) + np.sin(a) * cross + (1 - np.cos(a)) * cross @ cross
-
-
-def grid(spacing, turn, shape=(64, 60, 56)):
-  """Returns an affine map from indices to metres with the ellipsoid's middle inside."""
-  affine = np.eye(4)
-  affine[:3, :3] = turn @ np.diag(spacing)
-  affine[:3, 3] = CENTER - affine[:3, :3] @ (np.array(shape) / 2.1)
-  return affine
-
-
-def ellipsoid(affine, shape=(64, 60, 56), radii=RADII, label=1):
+def ellipsoid(affine, shape=SHAPE, radii=RADII, label=1):
   """Returns the label map of an ellipsoid that stands upright in the world."""
-  index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-  world = index @ affine[:3, :3].T + affine[:3, 3]
-  inside = (((world - CENTER) / radii) ** 2).sum(axis=-1) < 1
+  inside = ((oblique.places(affine, shape) / radii) ** 2).sum(axis=-1) < 1
   return np.where(inside, label, 0).astype(np.int16)
 
 
 GRIDS = {
-  "even": grid([1.2e-3] * 3, np.eye(3)),
-  "thick slices": grid([0.9e-3, 0.9e-3, 2.5e-3], np.eye(3), (84, 84, 30)),
-  "oblique": grid([1.2e-3, 1.0e-3, 1.6e-3], rotation()),
-  "mirrored": grid([1.2e-3, 1.2e-3, 1.4e-3], np.diag([-1.0, 1.0, 1.0])),
+  "even": oblique.affine([1.2e-3] * 3, np.eye(3), SHAPE),
+  "thick slices": oblique.affine([0.9e-3, 0.9e-3, 2.5e-3], np.eye(3), (84, 84, 30)),
+  "oblique": oblique.affine([1.2e-3, 1.0e-3, 1.6e-3], oblique.rotation(35), SHAPE),
+  "mirrored": oblique.affine([1.2e-3, 1.2e-3, 1.4e-3], np.diag([-1.0, 1.0, 1.0]), SHAPE),
 }
 SHAPES = {"thick slices": (84, 84, 30)}
 
 
-def moments(vertices, triangles):
-  """Returns the centroid of the solid inside a surface."""
-  corner = vertices[triangles] - CENTER
-  share = (corner[:, 0] * np.cross(corner[:, 1], corner[:, 2])).sum(axis=1) / 6
-  return CENTER + share @ corner.sum(axis=1) / 4 / share.sum()
-
-
 @pytest.mark.parametrize("name", GRIDS)
 def test_surface_is_the_ellipsoid(name):
-  affine, shape = GRIDS[name], SHAPES.get(name, (64, 60, 56))
+  affine, shape = GRIDS[name], SHAPES.get(name, SHAPE)
   vertices, triangles = volumes.surface(ellipsoid(affine, shape) == 1, affine)
   q = quality(vertices, triangles)
   assert q.closed, q  # positive volume: outward, mirrored or not
   # Smoothing over s = 0.6 voxel edges moves the surface in by s^2 / r, 1 % of the volume at 2.5 mm.
   expected = 4 / 3 * np.pi * RADII.prod()
   assert enclosed(vertices, triangles) == pytest.approx(expected, rel=0.03)
-  np.testing.assert_allclose(moments(vertices, triangles), CENTER, atol=2e-4)
+  np.testing.assert_allclose(oblique.centroid(vertices, triangles), CENTER, atol=2e-4)
   np.testing.assert_allclose(np.ptp(vertices, axis=0), 2 * RADII, atol=1.5e-3)
 
 
@@ -143,7 +121,7 @@ def test_segments_in_layers_are_read_by_name(tmp_path):
     assert report.losses == ()
     # 250 nodes cut 3 % off, smoothing up to 3 % more.
     assert report.volume == pytest.approx(4 / 3 * np.pi * (size * RADII).prod(), rel=0.08)
-    np.testing.assert_allclose(moments(vertices, triangles), CENTER, atol=5e-4)
+    np.testing.assert_allclose(oblique.centroid(vertices, triangles), CENTER, atol=5e-4)
   with pytest.raises(ValueError, match=r"label is 1 in 2 layers, .*: 1 \(Liver\), 1 \(Tumour 1\)"):
     volumes.wrap_volume(path, label=1)
   with pytest.raises(ValueError, match=r"label is Spleen, .*: 1 \(Liver\), 1 \(Tumour 1\), 2"):
@@ -182,7 +160,7 @@ def test_wrap_volume_makes_an_organ(tmp_path):
   assert report.foldovers == 0
   # 500 nodes cut 1 % off, smoothing as above.
   assert q.volume == pytest.approx(4 / 3 * np.pi * RADII.prod(), rel=0.04)
-  np.testing.assert_allclose(moments(vertices, triangles), CENTER, atol=3e-4)
+  np.testing.assert_allclose(oblique.centroid(vertices, triangles), CENTER, atol=3e-4)
   up = normals(vertices, triangles)
   out = vertices[triangles].mean(axis=1) - CENTER
   assert (np.einsum("md,md->m", up, out) > 0).all()

@@ -62,7 +62,12 @@ def test_expert_solves_the_easy_tasks(name):
   assert wins(name, range(1)) == 1
 
 
-@pytest.mark.parametrize("name", [name for name in OTHERS if name not in LONG])
+# What an expert solves when easy and when hard it solves in between.
+@pytest.mark.parametrize("name", [
+  pytest.param(name, marks=pytest.mark.slow) if name.endswith("standard") else name
+  for name in OTHERS
+  if name not in LONG
+])  # fmt: skip
 def test_expert_solves_the_others(name):
   assert wins(name, range(1)) == 1
 
