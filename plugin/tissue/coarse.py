@@ -28,6 +28,10 @@ _ENTRIES = 4  # weights of a vertex
 # at 75, 0.9 at 110 and 0.8 at 220 on the CPU (2562 to 16,386 nodes, medians of CPU time); a cycle
 # takes as long as 9 iterations there and as 15 on an H200 (`palpate bench solver`).
 _THRESHOLD = {"cpu": 100.0, "cuda": 300.0}
+# Nodes from which they may: what acts on one node of a small mesh reaches the others in few
+# iterations. With 280 to 1025 nodes and condition numbers of 256 to 7500 block Jacobi took 2 to 6
+# times the cycles, in 0.5 to 0.9 of their time; a stiff shell of 1446 nodes takes 0.6 to 0.8 with them.
+_FEWEST = 1200
 # Interval of the smoother, as greatest eigenvalue of D^-1 A and its ratio to the lower end, by
 # degree. A membrane's is 2.3 on good meshes, at most 3 (three corners an element), and bending
 # raises it to 3.4; the smoother stays a contraction up to the sum of both ends.
@@ -305,15 +309,17 @@ def threshold(device) -> float:
 def pay(part: dict, scale: float, threshold: float) -> bool:
   """Returns whether cycles take less time than block Jacobi at the time step of `scale`.
 
-  Not on a membrane: contact moves it where it is touched, and block Jacobi takes about ten times
-  the cycles, warm half of that, from 678 to 262,146 nodes and from 3 kPa to 3 MPa, while a cycle
-  takes as long as eight iterations and more.
+  Not on a small mesh. Not on a membrane: contact moves it where it is touched, and block Jacobi
+  takes about ten times the cycles, warm half of that, from 678 to 262,146 nodes and from 3 kPa to
+  3 MPa, while a cycle takes as long as eight iterations and more.
 
   Args:
     part: fields of the mesh, see `shape.arrays`
     scale: (h^2 + h damping) over the mean mass of a node [s^2/kg]
     threshold: condition number from which they do
   """
+  if (part["vert"] >= 0).sum() < _FEWEST:
+    return False
   membrane, bend = stiffness(part)
   return bend > _BENDING * membrane and scale * (membrane + bend) >= threshold
 
