@@ -57,7 +57,7 @@ from ...core.stage import Stage
 from ...registry import exercise
 from . import drain, knot
 from .drain import BITE
-from .knot import BEYOND, HOLD, Knot, Tie, follow, judge, see_tails
+from .knot import BEYOND, Knot, follow, judge, see_tails
 from .needles import (
   LEFT,
   LOST,
@@ -87,6 +87,7 @@ from .needles import (
   tip_angle,
   turn_on,
 )
+from .tie import HOLD, Tie
 
 FIELD = Scene(
   instrument="psm", second="psm", port=(0.06, -0.1, 0.08), second_port=(-0.06, -0.1, 0.08),
