@@ -67,6 +67,13 @@ PALPATE double tension_of(const Fields& f, const double* x, int edge) {
   return f.stretch.data[edge] * (norm(load(x + 3 * edge + 3) - load(x + 3 * edge)) - f.length.data[edge]);
 }
 
+// The tension of an edge after a move, four numbers a node, by how its ends part along it.
+template <class Fields>
+PALPATE double expected_tension(const Fields& f, const double* x, const double* move, int edge) {
+  const D3 parts = load(move + 4 * edge + 4) - load(move + 4 * edge);
+  return is_whole(f, edge) ? tension_of(f, x, edge) + f.stretch.data[edge] * dot(parts, tangent(x, edge)) : 0.0;
+}
+
 // The twist at a node inside, with edges turned by `turn` since the step began.
 template <class Fields>
 PALPATE double twist_at(const Fields& f, const double* x, const double* turn, int i) {
@@ -194,14 +201,16 @@ PALPATE void add_twist(const Fields& f, const Bent& b, int i, double twist, doub
 }
 
 // Adds the gradient of the energy and its second derivative, or where that is not to be `exact` a part of it
-// that is positive: without the thrust of edges, and without what a moment does as edges turn.
+// that is positive: without the thrust of edges, and without what a moment does as edges turn. Edges resist turning by
+// the tension that a whole move led to expect, `f.pull`: as a light node swings far its edge gets longer for now, and by
+// that tension the node would seem held.
 template <class Fields>
 PALPATE void add_rod(const Fields& f, const double* x, const double* turn, double* g, const RodMatrix& H, bool exact) {
   each_apart<2>(0, f.nnode - 1, [&](int i) {
     if (!is_whole(f, i)) return;
     const D3 e = load(x + 3 * i + 3) - load(x + 3 * i);
     const double l = norm(e) + 1e-300, k = f.stretch.data[i], tension = k * (l - f.length.data[i]);
-    const double w[2] = {-1.0, 1.0}, across = exact || tension > 0.0 ? tension / l : 0.0;
+    const double w[2] = {-1.0, 1.0}, pull = f.pull.data[i], across = exact || pull > 0.0 ? pull / l : 0.0;
     Terms<2> terms;
     terms.add(w, (1.0 / l) * e, tension, k - across);
     terms.add_each(w, across);
