@@ -226,28 +226,29 @@ PALPATE void add_rod(const Fields& f, const double* x, const double* turn, doubl
     const D3 e = (1.0 / b.le) * b.e, d = (1.0 / b.lf) * b.f;
     const D3 axis = fabs(e.x) < 0.6 ? D3{1.0, 0.0, 0.0} : D3{0.0, 1.0, 0.0};
     const D3 n = unit(t > 1e-12 ? b.curvature : cross(e, axis)), pe = cross(n, e), pf = cross(n, d);
-    Terms<3> terms;
-    const auto add = [&](D3 at_e, D3 at_f, double force, double stiffness) {
-      double v[9];
-      store(v, -1.0 * at_e);
-      store(v + 3, at_e - at_f);
-      store(v + 6, at_f);
-      terms.add(v, force, stiffness);
-    };
     const double re = 1.0 / b.le, rf = 1.0 / b.lf, moment = 2.0 * B * t * more;
-    const D3 none = {0.0, 0.0, 0.0};
-    add(-re * pe, rf * pf, moment, B * more * (1.0 + 3.0 * t * t));
-    add(re * n, -rf * n, 0.0, B * more);
-    if (exact) {
-      add(re * n, rf * n, 0.0, -B * t * t * more);
-      const double se = 0.5 * moment * re * re, sf = 0.5 * moment * rf * rf;
-      add(e + pe, none, 0.0, se);
-      add(e - pe, none, 0.0, -se);
-      add(none, d + pf, 0.0, -sf);
-      add(none, d - pf, 0.0, sf);
-    }
-    const int node[3] = {i - 1, i, i + 1};
-    terms.scatter(node, g, H);
+    const D3 at_e = -moment * re * pe, at_f = moment * rf * pf;
+    store(g + 4 * i - 4, load(g + 4 * i - 4) - at_e);
+    store(g + 4 * i, load(g + 4 * i) + at_e - at_f);
+    store(g + 4 * i + 4, load(g + 4 * i + 4) + at_f);
+    // By the edges e and f, in their plane and across it.
+    const double in = B * more * (1.0 + 3.0 * t * t), turns = exact ? B * t * t * more : 0.0, bends = exact ? moment : 0.0;
+    const double E[3] = {e.x, e.y, e.z}, F[3] = {d.x, d.y, d.z}, N[3] = {n.x, n.y, n.z};
+    const double P[3] = {pe.x, pe.y, pe.z}, Q[3] = {pf.x, pf.y, pf.z};
+    double ee[3][3], fe[3][3], ff[3][3];
+    for (int c = 0; c < 3; ++c)
+      for (int k = 0; k < 3; ++k) {
+        const double across = N[c] * N[k];
+        ee[c][k] = re * re * (in * P[c] * P[k] + (B * more - turns) * across + bends * (E[c] * P[k] + P[c] * E[k]));
+        ff[c][k] = rf * rf * (in * Q[c] * Q[k] + (B * more - turns) * across - bends * (F[c] * Q[k] + Q[c] * F[k]));
+        fe[c][k] = -re * rf * (in * Q[c] * P[k] + (B * more + turns) * across);
+      }
+    H.add(i - 1, 3, i - 1, 3, [&](int c, int k) { return ee[c][k]; });
+    H.add(i, 3, i - 1, 3, [&](int c, int k) { return fe[c][k] - ee[c][k]; });
+    H.add(i, 3, i, 3, [&](int c, int k) { return ee[c][k] - fe[c][k] - fe[k][c] + ff[c][k]; });
+    H.add(i + 1, 3, i - 1, 3, [&](int c, int k) { return -fe[c][k]; });
+    H.add(i + 1, 3, i, 3, [&](int c, int k) { return fe[c][k] - ff[c][k]; });
+    H.add(i + 1, 3, i + 1, 3, [&](int c, int k) { return ff[c][k]; });
     if (f.twists) add_twist(f, b, i, twist_at(f, x, turn, i), g, H);
   });
 }
