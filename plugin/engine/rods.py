@@ -43,8 +43,8 @@ _MUJOCOS = (
 )
 _WRITTEN = (
   *("start", "vel", "external", "aim", "place", "turn", "force", "move", "trial", "gradient"),
-  *("matrix", "inverse", "rank", "near", "ranked", "first", "start_of_row", "last", "below"),
-  *("status", "count", "smooth", "reach", "listed", "pair", "pressure", "touch", "stands"),
+  *("pull", "matrix", "inverse", "rank", "near", "ranked", "first", "start_of_row", "last"),
+  *("below", "status", "count", "smooth", "reach", "listed", "pair", "pressure", "touch", "stands"),
   *("row_kind", "row_node", "row_efc", "row_tree", "row_yields", "row_body"),
   *("row_value", "grip", "known", "speed"),
 )
@@ -90,6 +90,7 @@ class Rod:
   move: doubles("nunknown")  # change of the unknowns
   trial: doubles("nunknown")  # scratch
   gradient: doubles("nunknown")  # of what a step makes least
+  pull: doubles("nnode")  # tension of an edge that the last iteration led to expect [N]
   matrix: doubles("nentry")  # its second derivative, and the factors of that, see `Envelope`
   inverse: doubles("nentry")  # of the matrix without constraints, there
   rank: ints("nplace")  # of a node in the matrix

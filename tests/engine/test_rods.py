@@ -107,7 +107,8 @@ def test_free_flight_keeps_momentum():
 
 
 def test_energy_only_falls():
-  model, data, thread = load(line(41, 0.08), pin=(0,), option=FREE)
+  """Though light nodes are flung about, no step takes more than 10 iterations."""
+  model, data, thread = load(line(41, 0.08), pin=(0,), option=FREE, iterations=10)
   rng = np.random.RandomState(1)
   data.qvel[:] = np.repeat(rng.normal(0, 1.0, (8, 3)), 5, axis=0).ravel()
   energies = []

@@ -20,6 +20,7 @@ PALPATE double most_together(double v) {
   }
   return v;
 }
+PALPATE int least_together(int v) { return __reduce_min_sync(0xffffffffu, v); }
 // The sum of v over the lanes up to this one, or the most.
 PALPATE int sum_up_to(int v) {
   for (int o = 1; o < TOGETHER; o <<= 1) {
@@ -35,6 +36,20 @@ PALPATE int most_up_to(int v) {
   }
   return v;
 }
+// Notes each i from `from` up to `to` where is(i), in their order; returns how many there are.
+template <class Is>
+PALPATE int note_those(int from, int to, Is is, int* into) {
+  int count = 0;
+  for (; from < to; from += TOGETHER) {
+    const int i = from + own_lane();
+    const bool own = i < to && is(i);
+    const unsigned all = __ballot_sync(0xffffffffu, own);
+    if (own) into[count + __popc(all & ((1u << own_lane()) - 1))] = i;
+    count += __popc(all);
+  }
+  meet_lanes();
+  return count;
+}
 PALPATE int of_last_lane(int v) { return __shfl_sync(0xffffffffu, v, TOGETHER - 1); }
 // What several lanes may do to one number.
 PALPATE void lower(int& at, int v) { atomicMin(&at, v); }
@@ -46,6 +61,7 @@ PALPATE int own_lane() { return 0; }
 PALPATE void meet_lanes() {}
 PALPATE double sum_together(double v) { return v; }
 PALPATE double most_together(double v) { return v; }
+PALPATE int least_together(int v) { return v; }
 PALPATE void lower(int& at, int v) { at = v < at ? v : at; }
 PALPATE void set_bits(unsigned& at, unsigned bits) { at |= bits; }
 #endif

@@ -72,8 +72,6 @@ PALPATE void invert_there(const Envelope& L, const Envelope& Z, int* below, doub
 
 #if ON_CUDA
 
-constexpr int AT_ONCE = 4;  // entries of a lane that are on their way at once
-
 // Notes of every ROWS columns, node by node, which is the last node that has them.
 template <int ROWS>
 PALPATE void note_last(const Envelope& A) {
@@ -93,6 +91,7 @@ PALPATE void note_last(const Envelope& A) {
 template <int ROWS>
 PALPATE bool factorize(const Envelope& A, double* u) {
   double *whole = u, *left = u + A.n;  // of a row its diagonal as it was, and D times what it has in the pivot's columns
+  int* node = A.last + A.n / ROWS;     // whose rows have the pivot's columns
   note_last<ROWS>(A);
   each_lane(0, A.n, [&](int i) { whole[i] = A.row(i)[i]; });
   for (int p = 0; p < A.n / ROWS; ++p) {
@@ -114,35 +113,27 @@ PALPATE bool factorize(const Envelope& A, double* u) {
       if (!(d[a] > 1e-12 * whole[i + a])) return false;
       rest[a] = 1.0 / d[a];
     }
-    const int next = i + ROWS, count = ROWS * (A.last[p] - p);  // rows, of which not all have these columns
-    each_lane(0, count, [&](int k) {
-      const bool has = A.first[next + k] <= i;
-      double own[ROWS], *row = A.row(next + k) + i;
-      for (int b = 0; b < ROWS; ++b) {
-        own[b] = has ? row[b] : 0.0;
+    const int count = note_those(p + 1, A.last[p] + 1, [&](int q) { return A.first[ROWS * q] <= i; }, node);
+    each_lane(0, ROWS * count, [&](int k) {
+      double own[ROWS], *row = A.row(ROWS * node[k / ROWS] + k % ROWS) + i;
+      for (int b = 0; b < ROWS; ++b) own[b] = row[b];
+      for (int b = 0; b < ROWS; ++b)
         for (int c = 0; c < b; ++c) own[b] -= own[c] * l[b][c];
-        if (has) row[b] = own[b] * rest[b];
-        left[count * b + k] = own[b];
-      }
+      for (int b = 0; b < ROWS; ++b) row[b] = own[b] * rest[b], left[ROWS * k + b] = own[b];
     });
-    for (int from = own_lane(); from < count * (count + 1) / 2; from += AT_ONCE * TOGETHER) {
-      double *to[AT_ONCE], now[AT_ONCE];  // of several entries, which are read before any is written
-#pragma unroll
-      for (int q = 0; q < AT_ONCE; ++q) {
-        const int entry = from + q * TOGETHER;
-        const Corner at = corner(entry);
-        to[q] = nullptr;
-        if (entry >= count * (count + 1) / 2 || A.first[next + at.row] > i) continue;
-        double *row = A.row(next + at.row), sum = 0.0;
-        for (int c = 0; c < ROWS; ++c) sum += row[i + c] * left[count * c + at.column];
-        to[q] = row + next + at.column;
-        now[q] = *to[q] - sum;
+    // A row of one node at the columns of another, of which all is read before any is written.
+    each_lane(0, ROWS * (count * (count + 1) / 2), [&](int k) {
+      const Corner at = corner(k / ROWS);
+      const int r = k % ROWS, most = at.row == at.column ? r + 1 : ROWS;
+      double now[ROWS], *row = A.row(ROWS * node[at.row] + r), *to = row + ROWS * node[at.column];
+      const double* other = left + ROWS * ROWS * at.column;
+      for (int b = 0; b < ROWS; ++b) {
+        double sum = 0.0;
+        for (int c = 0; c < ROWS; ++c) sum += row[i + c] * other[ROWS * b + c];
+        now[b] = to[b] - sum;
       }
-#pragma unroll
-      for (int q = 0; q < AT_ONCE; ++q)
-        if (to[q]) *to[q] = now[q];
-    }
-    meet_lanes();
+      for (int b = 0; b < most; ++b) to[b] = now[b];
+    });
     if (own_lane() < ROWS) {
       double* row = A.row(i + own_lane()) + i;
       for (int a = 0; a < ROWS; ++a) {

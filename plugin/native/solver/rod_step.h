@@ -16,8 +16,9 @@ AS_WRITTEN
 namespace palpate {
 
 constexpr int DOFS = 6;  // of the two nodes that a row reaches
-// Newton's method ends when no node moves by more than this share of the radius.
-constexpr double CLOSE = 1e-5;
+// Newton's method ends when no node moves by more than this share of the radius: by CLOSE where the cost fell as was
+// expected, up to a share FORESEEN, since much less is then left to go, or else by STALLED.
+constexpr double CLOSE = 1e-3, STALLED = 1e-5, FORESEEN = 0.1;
 constexpr double SLOPE = 1e-4;  // of a step's decrease, the least (Armijo)
 constexpr double ROUNDED = 1e-15;  // of the cost, what is less than its last digits
 constexpr int HALVINGS = 30;
@@ -282,6 +283,7 @@ PALPATE int step_rod(const Fields& f, double h) {
   note_pressure(f);
   predict(f, h);
   double cost = step_cost(f, x, turn, h);
+  each_lane(0, f.nnode - 1, [&](int i) { f.pull.data[i] = tension_of(f, f.start.data, i); });
   int iteration = 0;
   for (; iteration < f.newton; ++iteration) {
     if (is_stale(f, x)) {
@@ -309,6 +311,7 @@ PALPATE int step_rod(const Fields& f, double h) {
     falls = sum_together(falls), most = most_together(most);
     if (!(falls == falls) || !(most < 1e6)) return -1;
     const double whole = safe_part(f, x, f.move.data, 4);
+    const double before = cost;
     double part = whole;
     for (int k = 0; k < HALVINGS; ++k, part *= 0.5) {
       each_lane(0, n, [&](int i) {
@@ -323,10 +326,15 @@ PALPATE int step_rod(const Fields& f, double h) {
         break;
       }
     }
+    each_lane(0, f.nnode - 1, [&](int i) {
+      f.pull.data[i] = part == 1.0 ? expected_tension(f, x, f.move.data, i) : tension_of(f, trial, i);
+    });
     each_lane(0, 3 * n, [&](int a) { x[a] = trial[a]; });
     each_lane(0, f.nnode, [&](int i) { turn[i] = trial_turn[i]; });
     // A move that was cut short by contacts is not the last one.
-    if ((part * most < CLOSE * f.radius && whole == 1.0) || -falls < ROUNDED * cost) return iteration + 1;
+    const bool foreseen = part == 1.0 && fabs(before - cost + 0.5 * falls) < FORESEEN * -falls;
+    const bool ends = whole == 1.0 && part * most < (foreseen ? CLOSE : STALLED) * f.radius;
+    if (ends || -falls < ROUNDED * cost) return iteration + 1;
   }
   return f.newton + 1;
 }

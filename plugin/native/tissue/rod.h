@@ -67,6 +67,13 @@ PALPATE double tension_of(const Fields& f, const double* x, int edge) {
   return f.stretch.data[edge] * (norm(load(x + 3 * edge + 3) - load(x + 3 * edge)) - f.length.data[edge]);
 }
 
+// The tension of an edge after a move, four numbers a node, by how its ends part along it.
+template <class Fields>
+PALPATE double expected_tension(const Fields& f, const double* x, const double* move, int edge) {
+  const D3 parts = load(move + 4 * edge + 4) - load(move + 4 * edge);
+  return is_whole(f, edge) ? tension_of(f, x, edge) + f.stretch.data[edge] * dot(parts, tangent(x, edge)) : 0.0;
+}
+
 // The twist at a node inside, with edges turned by `turn` since the step began.
 template <class Fields>
 PALPATE double twist_at(const Fields& f, const double* x, const double* turn, int i) {
@@ -194,14 +201,16 @@ PALPATE void add_twist(const Fields& f, const Bent& b, int i, double twist, doub
 }
 
 // Adds the gradient of the energy and its second derivative, or where that is not to be `exact` a part of it
-// that is positive: without the thrust of edges, and without what a moment does as edges turn.
+// that is positive: without the thrust of edges, and without what a moment does as edges turn. Edges resist turning by
+// the tension that a whole move led to expect, `f.pull`: as a light node swings far its edge gets longer for now, and by
+// that tension the node would seem held.
 template <class Fields>
 PALPATE void add_rod(const Fields& f, const double* x, const double* turn, double* g, const RodMatrix& H, bool exact) {
   each_apart<2>(0, f.nnode - 1, [&](int i) {
     if (!is_whole(f, i)) return;
     const D3 e = load(x + 3 * i + 3) - load(x + 3 * i);
     const double l = norm(e) + 1e-300, k = f.stretch.data[i], tension = k * (l - f.length.data[i]);
-    const double w[2] = {-1.0, 1.0}, across = exact || tension > 0.0 ? tension / l : 0.0;
+    const double w[2] = {-1.0, 1.0}, pull = f.pull.data[i], across = exact || pull > 0.0 ? pull / l : 0.0;
     Terms<2> terms;
     terms.add(w, (1.0 / l) * e, tension, k - across);
     terms.add_each(w, across);
@@ -217,28 +226,29 @@ PALPATE void add_rod(const Fields& f, const double* x, const double* turn, doubl
     const D3 e = (1.0 / b.le) * b.e, d = (1.0 / b.lf) * b.f;
     const D3 axis = fabs(e.x) < 0.6 ? D3{1.0, 0.0, 0.0} : D3{0.0, 1.0, 0.0};
     const D3 n = unit(t > 1e-12 ? b.curvature : cross(e, axis)), pe = cross(n, e), pf = cross(n, d);
-    Terms<3> terms;
-    const auto add = [&](D3 at_e, D3 at_f, double force, double stiffness) {
-      double v[9];
-      store(v, -1.0 * at_e);
-      store(v + 3, at_e - at_f);
-      store(v + 6, at_f);
-      terms.add(v, force, stiffness);
-    };
     const double re = 1.0 / b.le, rf = 1.0 / b.lf, moment = 2.0 * B * t * more;
-    const D3 none = {0.0, 0.0, 0.0};
-    add(-re * pe, rf * pf, moment, B * more * (1.0 + 3.0 * t * t));
-    add(re * n, -rf * n, 0.0, B * more);
-    if (exact) {
-      add(re * n, rf * n, 0.0, -B * t * t * more);
-      const double se = 0.5 * moment * re * re, sf = 0.5 * moment * rf * rf;
-      add(e + pe, none, 0.0, se);
-      add(e - pe, none, 0.0, -se);
-      add(none, d + pf, 0.0, -sf);
-      add(none, d - pf, 0.0, sf);
-    }
-    const int node[3] = {i - 1, i, i + 1};
-    terms.scatter(node, g, H);
+    const D3 at_e = -moment * re * pe, at_f = moment * rf * pf;
+    store(g + 4 * i - 4, load(g + 4 * i - 4) - at_e);
+    store(g + 4 * i, load(g + 4 * i) + at_e - at_f);
+    store(g + 4 * i + 4, load(g + 4 * i + 4) + at_f);
+    // By the edges e and f, in their plane and across it.
+    const double in = B * more * (1.0 + 3.0 * t * t), turns = exact ? B * t * t * more : 0.0, bends = exact ? moment : 0.0;
+    const double E[3] = {e.x, e.y, e.z}, F[3] = {d.x, d.y, d.z}, N[3] = {n.x, n.y, n.z};
+    const double P[3] = {pe.x, pe.y, pe.z}, Q[3] = {pf.x, pf.y, pf.z};
+    double ee[3][3], fe[3][3], ff[3][3];
+    for (int c = 0; c < 3; ++c)
+      for (int k = 0; k < 3; ++k) {
+        const double across = N[c] * N[k];
+        ee[c][k] = re * re * (in * P[c] * P[k] + (B * more - turns) * across + bends * (E[c] * P[k] + P[c] * E[k]));
+        ff[c][k] = rf * rf * (in * Q[c] * Q[k] + (B * more - turns) * across - bends * (F[c] * Q[k] + Q[c] * F[k]));
+        fe[c][k] = -re * rf * (in * Q[c] * P[k] + (B * more + turns) * across);
+      }
+    H.add(i - 1, 3, i - 1, 3, [&](int c, int k) { return ee[c][k]; });
+    H.add(i, 3, i - 1, 3, [&](int c, int k) { return fe[c][k] - ee[c][k]; });
+    H.add(i, 3, i, 3, [&](int c, int k) { return ee[c][k] - fe[c][k] - fe[k][c] + ff[c][k]; });
+    H.add(i + 1, 3, i - 1, 3, [&](int c, int k) { return -fe[c][k]; });
+    H.add(i + 1, 3, i, 3, [&](int c, int k) { return fe[c][k] - ff[c][k]; });
+    H.add(i + 1, 3, i + 1, 3, [&](int c, int k) { return ff[c][k]; });
     if (f.twists) add_twist(f, b, i, twist_at(f, x, turn, i), g, H);
   });
 }

@@ -168,34 +168,34 @@ CALLED void order_nodes(const Fields& f, const double* x) {
       for (int b = j; b < j + 2; ++b) join(a, b);
   });
   unsigned* seen = near + n * words;  // what a node before has to do with, and these
-  int* front = f.below.data;          // those of them that have no rank yet
-  one_lane([&] {
-    int count = 0, next = 0;
-    for (int rank = 0; rank < n; ++rank) {
-      int best = -1, fewest = n + 1;
-      for (int k = 0; k < count; ++k) {
-        int adds = 0;
-        for (int a = 0; a < words; ++a) adds += bits(near[front[k] * words + a] & ~seen[a]);
-        if (adds < fewest) fewest = adds, best = k;
-      }
-      int node;
-      if (best < 0) {
-        while (has(seen, next)) ++next;
-        node = next;
-        seen[node / 32] |= 1u << (node % 32);
-      } else {
-        node = front[best];
-        for (int k = best; k + 1 < count; ++k) front[k] = front[k + 1];
-        --count;
-      }
-      f.rank.data[node] = rank;
-      for (int a = 0; a < words; ++a) {
-        unsigned adds = near[node * words + a] & ~seen[a];
-        seen[a] |= adds;
-        for (; adds; adds &= adds - 1) front[count++] = 32 * a + lowest_bit(adds);
-      }
-    }
-  });
+  int *rank = f.rank.data, *front = f.below.data;  // what is seen, in that order; those from `first` on may have no rank yet
+  each_lane(0, n, [&](int i) { rank[i] = -1; });
+  int count = 0, first = 0, next = 0;
+  for (int own = 0; own < n; ++own) {
+    while (first < count && rank[front[first]] >= 0) ++first;
+    int least = n * (n + 1);  // how many it adds, and where it is in front
+    each_lane(first, count, [&](int k) {
+      if (rank[front[k]] >= 0) return;
+      int adds = 0;
+      for (int a = 0; a < words; ++a) adds += bits(near[front[k] * words + a] & ~seen[a]);
+      const int key = adds * n + k;
+      least = key < least ? key : least;
+    });
+    while (first == count && has(seen, next)) ++next;
+    const int node = first < count ? front[least_together(least) % n] : next;
+    one_lane([&] {
+      rank[node] = own;
+      seen[node / 32] |= 1u << (node % 32);
+    });
+    count += each_after(words, [&](int a, int at) {
+      unsigned adds = near[node * words + a] & ~seen[a];
+      const int more = bits(adds);
+      if (at < 0) return more;
+      seen[a] |= adds;
+      for (int* to = front + count + at; adds; adds &= adds - 1) *to++ = 32 * a + lowest_bit(adds);
+      return more;
+    });
+  }
 }
 
 // Lists pairs, as far away as there is room, and orders the nodes.
@@ -361,7 +361,10 @@ template <class Fields>
 CALLED void note_pressure(const Fields& f) {
   double fastest = f.slow;
   each_lane(0, f.count.data[1], [&](int p) {
-    const Nearest at = nearest_edges(f.start.data, f.pair.data[2 * p], f.pair.data[2 * p + 1]);
+    const int i = f.pair.data[2 * p], j = f.pair.data[2 * p + 1];
+    f.pressure.data[p] = 0.0;
+    if (!may_be_near(f, f.start.data, i, j, 2.0 * f.radius)) return;
+    const Nearest at = nearest_edges(f.start.data, i, j);
     const double distance = norm(at.off);
     const Barrier b = barrier(f, distance);
     f.pressure.data[p] = distance <= 2.0 * CORE * f.radius ? -1.0 : -b.slope;
