@@ -9,7 +9,8 @@ end of the needle that goes first [m]; `trail` (3,), to the other end; `circle` 
 needle's circle [-]; `way` (3,), way through the ring [-]; `target` (3,), from the tip of the hand
 that is to take the needle to where the arc is 25 degrees from its first end [m]; `through` (1,),
 share of the needle that is through [-]; `right_holds` (1,), `left_holds` (1,), whether a hand holds
-the needle.
+the needle. In the frame of the hand that is to take it: `hand_target` (3,), what `target` is [m];
+`hand_circle` (3,), what `circle` is [-]; `hand_along` (3,), way along the needle there [-].
 
 Progress: (done + part) / number, part being 0.25 * closeness of the first end to the ring; once it
 is through, 0.25 + 0.4 * through, and 0.1 more when the taking hand holds the needle, 0.1 when it
@@ -39,6 +40,7 @@ from ...core.rules import (
   Vector,
   closeness,
   dot,
+  in_hand,
   length,
   needle_place,
   other_tip,
@@ -133,6 +135,9 @@ class State(Hands):
   circle: Vector
   way: Vector
   target: Vector
+  hand_target: Vector
+  hand_circle: Vector
+  hand_along: Vector
 
 
 # The rules.
@@ -212,8 +217,12 @@ def observe(s, o):
   o.trail = from_first(s, o, 1.0) - middle
   o.circle = needle_place(s, vector(0.0, 0.0, 1.0)) - needle_place(s, vector(0.0, 0.0, 0.0))
   o.way = -o.ways[now(o)] if back(o) else 1.0 * o.ways[now(o)]
-  hand = tip(s) if back(o) else other_tip(s)
-  o.target = from_first(s, o, TAKEN) - hand
+  place, hand = from_first(s, o, TAKEN), 0 if back(o) else 1
+  o.target = place - (tip(s) if back(o) else other_tip(s))
+  o.hand_target = in_hand(s, hand, place)
+  o.hand_circle = in_hand(s, hand, place + o.circle) - o.hand_target
+  along = in_hand(s, hand, from_first(s, o, TAKEN + 0.01)) - o.hand_target
+  o.hand_along = along / length(along)
   return o
 
 
@@ -230,7 +239,8 @@ class Transfer(Needlework):
     State,
     advance,
     observe,
-    ("lead", "trail", "circle", "way", "target", "through", "right_holds", "left_holds"),
+    ("lead", "trail", "circle", "way", "target", "through", "right_holds", "left_holds",
+     "hand_target", "hand_circle", "hand_along"),
     metrics={"regrasps": "regrasps", "ring_contact": "scraping", "peak_ring_force": "worst"},
     columns={"regrasped": "regrasps", "ring_time": "scraping", "ring_force": "worst"},
     mark=mark,
