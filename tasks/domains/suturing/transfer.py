@@ -40,7 +40,6 @@ from ...core.rules import (
   Vector,
   closeness,
   dot,
-  in_hand,
   length,
   needle_place,
   other_tip,
@@ -59,9 +58,9 @@ from .needles import (
   QUARTER,
   RADIUS,
   TURNED,
-  Hands,
   Needlework,
   Pose,
+  Taking,
   apart,
   arc,
   carry,
@@ -70,6 +69,7 @@ from .needles import (
   grasp,
   grasped,
   height,
+  in_jaws,
   leave,
   left_grasp,
   lingers,
@@ -117,7 +117,7 @@ def hard(**kwargs):
   return Transfer(FIELD, **kwargs)
 
 
-class State(Hands):
+class State(Taking):
   """State of a world."""
 
   size: float  # of the rings: inner radius [m]
@@ -135,9 +135,6 @@ class State(Hands):
   circle: Vector
   way: Vector
   target: Vector
-  hand_target: Vector
-  hand_circle: Vector
-  hand_along: Vector
 
 
 # The rules.
@@ -217,13 +214,9 @@ def observe(s, o):
   o.trail = from_first(s, o, 1.0) - middle
   o.circle = needle_place(s, vector(0.0, 0.0, 1.0)) - needle_place(s, vector(0.0, 0.0, 0.0))
   o.way = -o.ways[now(o)] if back(o) else 1.0 * o.ways[now(o)]
-  place, hand = from_first(s, o, TAKEN), 0 if back(o) else 1
-  o.target = place - (tip(s) if back(o) else other_tip(s))
-  o.hand_target = in_hand(s, hand, place)
-  o.hand_circle = in_hand(s, hand, place + o.circle) - o.hand_target
-  along = in_hand(s, hand, from_first(s, o, TAKEN + 0.01)) - o.hand_target
-  o.hand_along = along / length(along)
-  return o
+  o.target = from_first(s, o, TAKEN) - (tip(s) if back(o) else other_tip(s))
+  hand, share = 0 if back(o) else 1, TAKEN if back(o) else 1.0 - TAKEN
+  return in_jaws(s, o, hand, share, 0.01 if back(o) else -0.01)
 
 
 def mark(s, o, k):
