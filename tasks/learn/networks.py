@@ -34,7 +34,11 @@ CHANGES = ("jaw", "head")  # ends of components that an actor says as changes: j
 # Ends of offsets [m] that an actor sees on a finer scale too: they begin large and decide small.
 FINELY = ("target", "front", "lead", "trail")
 POWER = 2.0  # an action is what the actor says times its size: slow motion is as clear as fast
-_BATCH, _RATE = 32, 3e-3  # lessons of a step
+# Windows of a step of the optimiser, as many as all lessons have at most, and steps of a window.
+_BATCH, _WINDOW, _RATE = 256, 96, 3e-3
+# Steps of the optimiser until the memories that windows begin with are found anew, and lessons that
+# this is done of at once.
+_ANEW, _TOGETHER = 40, 256
 FINE = 0.1  # errors above count by their size, not their square [-]
 _SELDOM = 0.01  # least mean size of a component: what is said seldom counts more [-]
 _PAST = 0.15  # how far past its limit a change is said: small errors do not open closed jaws [-]
@@ -101,7 +105,8 @@ class Networks:
     self.groups, self.device, self.lessons = grouped(list(shapes), taught, privileged), device, 0
     self.start = ""
     self._shapes: dict[str, tuple[int, ...]] = dict(shapes)
-    self._memory: Any = None
+    self._lessons: Any = None
+    self._steps = 0  # of the optimiser
     self._components = list(components)
     self._scaled: list[Any] = []  # networks that know how large observations are
     self._changes = [name for name in components if name.endswith(CHANGES)]
@@ -116,7 +121,8 @@ class Networks:
     sets = {"actor": [ACTING], "critic": [g for g in self.groups if g != PICTURES]}
     recurrent: dict[str, Any] = {"rnn_type": "gru", "rnn_hidden_dim": memory}
     recurrent["distribution_cfg"], count = gaussian, len(components)
-    recurrent["fine"] = self.fine = self._columns(FINELY)
+    finely = [name for name in self.groups[ACTING] if name.endswith(FINELY)]
+    recurrent["fine"] = self.fine = self._columns(finely)
     self.pixels = self._shapes[policy.PIXELS][:2] if PICTURES in self.groups else ()
     kind: Any = functools.partial(Seeing, size=self.pixels) if self.pixels else Sensing
     self.actor: Any = kind(seen, sets, "actor", count, **recurrent, **common).to(device)
@@ -129,14 +135,12 @@ class Networks:
   def _width(self, names: Sequence[str]) -> int:
     return sum(math.prod(self._shapes[name]) for name in names)
 
-  def _columns(self, ends: tuple[str, ...]) -> list[int]:
-    """Returns where in what the actor sees the observations are whose names end so."""
-    at, found = 0, []
+  def _columns(self, names: Sequence[str]) -> list[int]:
+    """Returns where in what the actor sees observations are."""
+    at, found = 0, {}
     for name in self.groups[ACTING]:
-      size = self._width([name])
-      found += range(at, at + size) if name.endswith(ends) else ()
-      at += size
-    return found
+      found[name] = range(at, at := at + self._width([name]))
+    return [k for name in names for k in found[name]]
 
   def normalise(self, seen: TensorDict) -> None:
     """Learns how large observations are; what was learned with others says the same as before."""
@@ -158,19 +162,24 @@ class Networks:
     self._scaled.append(model)
 
   def take(self, made: policy.Policy) -> None:
-    """Begins with what a policy of another exercise does; ValueError says why it cannot."""
+    """Begins with what a policy does that observes no more; ValueError says why it cannot."""
+    about, blind = made.about, set(self.groups[ACTING]) - set(made.about.observations)
     for what, own, other in (
-      ("observes", self._observed, (*made.about.observations, *_pictures(made.about.pixels))),
-      ("moves", self._components, made.about.components),
+      ("observes", self._observed, [*about.observations, *_pictures(about.pixels)]),
+      ("moves", self._components, list(about.components)),
     ):
-      if list(own) != list(other):
+      if [name for name in own if name not in blind] != other:
         raise ValueError(f"the policy {what} {', '.join(other)}, expected {', '.join(own)}")
-    weights, (mean, std) = self.actor.state_dict(), (made.mean, 1.0 / made.scale)
+    weights, at = self.actor.state_dict(), self._columns(about.observations)
     linear = [k.removesuffix(".weight") for k in weights if k.startswith("mlp") and "weight" in k]
     arrays = dict(zip([f"rnn.rnn.{gate}_l0" for gate in _GATES], made.memory or (), strict=False))
-    if self.fine and not made.about.fine and made.memory:  # it saw nothing on that scale
-      at, blind = len(made.mean), np.zeros((len(made.memory[0]), len(self.fine)), np.float32)
-      arrays[f"rnn.rnn.{_GATES[0]}_l0"] = np.insert(made.memory[0], [at], blind, axis=1)
+    width, size = self._width(self.groups[ACTING]), self.actor.rnn.rnn.input_size
+    finely = {at[k] for k in about.fine}
+    fine = [width + n for n, k in enumerate(self.fine) if k in finely]
+    inputs = [*at, *fine, *range(width + len(self.fine), size)]
+    if made.memory and len(inputs) == made.memory[0].shape[1]:
+      arrays[f"rnn.rnn.{_GATES[0]}_l0"] = weight = np.zeros((len(made.memory[0]), size), np.float32)
+      weight[:, inputs] = made.memory[0]
     pairs = [*zip(linear, made.layers, strict=False), *self._encoder(made.encoder)]
     for name, (weight, bias) in pairs:
       arrays |= {f"{name}.weight": weight, f"{name}.bias": bias}
@@ -181,7 +190,9 @@ class Networks:
       raise ValueError("the policy says its actions otherwise")
     for name, array in arrays.items():
       known[name].copy_(torch.from_numpy(array))
-    self._scale(self.actor, *(torch.from_numpy(row).to(self.device) for row in (mean, std)))
+    mean, std = torch.zeros(width), torch.ones(width)
+    mean[at], std[at] = torch.from_numpy(made.mean), torch.from_numpy(1.0 / made.scale)
+    self._scale(self.actor, mean.to(self.device), std.to(self.device))
 
   @property
   def _observed(self) -> list[str]:
@@ -217,6 +228,9 @@ class Networks:
   ) -> float:
     """Learns to do what was done in lessons, and what comes of it; returns the error.
 
+    A step of the optimiser goes over windows of lessons, not over whole ones: each control step has
+    to wait for the one before, whether many lessons are gone over or few.
+
     Args:
       lessons: of all rounds
       updates: steps of the optimiser
@@ -231,8 +245,7 @@ class Networks:
     for _ in range(updates):
       if (share := spent()) >= 1.0:
         break
-      some = self._some()
-      loss = self._error(some)
+      some, loss = self._some()
       values = self.critic(some["seen"]).squeeze(-1)
       both = loss + (some["present"] * (values - some["returns"]).square()).mean()
       optimiser.zero_grad()
@@ -248,12 +261,16 @@ class Networks:
     """Keeps lessons to learn from and to rehearse, and learns how large observations are."""
     self.lessons = len(lessons)
     whole = sorted((each for each in lessons if len(each.done)), key=lambda each: len(each.done))
-    self._memory = [self._read(lesson) for lesson in whole]
-    every = torch.cat([each["seen"] for each in self._memory])
-    self.normalise(every)
-    self.weigh(torch.cat([each["says"][each["taught"] > 0] for each in self._memory]))
-    for each in self._memory:
-      each["says"] += _PAST * each["limit"]
+    self._lengths = [len(each.done) for each in whole]
+    self._lessons = rows = torch.cat([self._read(each) for each in whole])
+    self._taught = torch.nonzero(rows["taught"]).squeeze(1)
+    self.normalise(rows["seen"])
+    self.weigh(rows["says"][self._taught])
+    rows["says"] += _PAST * rows["limit"]
+    lengths = torch.tensor(self._lengths, device=self.device)
+    self._ends = lengths.cumsum(0).repeat_interleave(lengths)  # of the lessons, for each row
+    self._starts = self._ends - lengths.repeat_interleave(lengths)
+    self._steps = 0
 
   def weigh(self, says: torch.Tensor) -> None:
     """Learns how much each component of what is to be said varies  (n, naction)."""
@@ -279,17 +296,34 @@ class Networks:
     }
     return TensorDict(rows, batch_size=[count]).to(self.device)
 
-  def _some(self) -> TensorDict:
-    """Returns lessons that are about as long, padded  (nstep, nlesson)."""
-    first = int(torch.randint(1 - _BATCH // 2, len(self._memory), ()))
-    chosen = self._memory[max(first, 0) : max(first + _BATCH, 1)]
-    return TensorDict.from_dict(_padded(chosen), batch_size=[len(chosen[-1]), len(chosen)])
+  def _some(self) -> tuple[TensorDict, torch.Tensor]:
+    """Returns windows of lessons (nstep, nwindow), and how far the actor is from what was meant."""
+    if self._steps % _ANEW == 0:
+      self._memories = self._remembered()
+    self._steps += 1
+    steps = torch.arange(min(_WINDOW, self._lengths[-1]), device=self.device)[:, None]
+    size = (min(_BATCH, math.ceil(len(self._lessons) / len(steps))),)
+    moment = self._taught[torch.randint(len(self._taught), size, device=self.device)]
+    before = torch.randint(len(steps), size, device=self.device)
+    first = torch.maximum(moment - before, self._starts[moment])
+    rows = first + steps
+    inside = rows < self._ends[moment]
+    some = self._lessons[rows.clamp(max=len(self._lessons) - 1)]
+    for key in ("taught", "present"):
+      some[key] *= inside
+    latent, _ = self.actor.rnn.rnn(self.actor.sense(some["seen"]), self._memories[None, first])
+    return some, self.error(latent, some["says"], some["taught"])
 
-  def _error(self, some: TensorDict) -> torch.Tensor:
-    """Returns how far the actor is from what was meant, each component by its size in lessons."""
-    actor = self.actor
-    latent, _ = actor.rnn.rnn(actor.sense(some["seen"]))
-    return self.error(latent, some["says"], some["taught"])
+  @torch.no_grad()
+  def _remembered(self) -> torch.Tensor:
+    """Returns what the actor remembers before each row of the lessons  (nrow, nmemory)."""
+    lessons, found = self.actor.sense(self._lessons["seen"]).split(self._lengths), []
+    for k in range(0, len(lessons), _TOGETHER):
+      some = lessons[k : k + _TOGETHER]
+      known, _ = self.actor.rnn.rnn(pad_sequence(some))
+      known = torch.cat([torch.zeros_like(known[:1]), known])
+      found += [known[: len(lesson), n] for n, lesson in enumerate(some)]
+    return torch.cat(found)
 
   def error(self, latent: torch.Tensor, says: torch.Tensor, taught: torch.Tensor) -> torch.Tensor:
     """Returns how far what the actor says by its memory is from what it should, where taught."""
@@ -302,11 +336,11 @@ class Networks:
     Args:
       rate: learning rate of the practice
     """
-    if self._memory is None:
+    if self._lessons is None:
       return
     self._last.param_groups[0]["lr"] = _CAREFUL * rate
     for _ in range(_REHEARSING):
-      loss = self._error(self._some())
+      _, loss = self._some()
       self._last.zero_grad()
       loss.backward()
       self._last.step()
@@ -360,14 +394,3 @@ def _rescale(model: Any, mean: torch.Tensor, std: torch.Tensor) -> None:
   with torch.no_grad():
     bias += weight @ ((mean - known["_mean"][0]) / known["_std"][0])
     weight *= std / known["_std"][0]
-
-
-def _padded(parts: Sequence[TensorDict]) -> dict[str, Any]:
-  """Returns what has rows of different number as columns, with zeros below."""
-  keys = parts[0].keys()
-  return {
-    key: _padded([part[key] for part in parts])
-    if isinstance(parts[0][key], TensorDict)
-    else pad_sequence([part[key] for part in parts])
-    for key in keys
-  }

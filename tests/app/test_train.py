@@ -207,6 +207,44 @@ def test_offsets_are_seen_on_a_finer_scale_which_an_older_policy_begins_without(
     np.testing.assert_allclose(act(step), last, atol=1e-5)
 
 
+def test_networks_begin_with_a_policy_that_observes_less():
+  names, less = ("pitch", "jaw"), {"held": (1,), "target": (3,)}
+  task = SimpleNamespace(name="any/easy", components=names, control_timestep=0.02)
+  more = {"held": (1,), "hook_front": (3,), "target": (3,), "through": (1,)}
+  older, made = (
+    networks.Networks(shapes, names, 8, (8,), 0.1, seed, "cpu")
+    for seed, shapes in ((0, less), (1, more))
+  )
+  taken = older.policy(task, {}, {})
+  made.take(taken)
+  random = np.random.RandomState(0)
+  lesson = [random.randn(9, 8), *(random.rand(9, 2) for _ in range(2)), np.ones(9), np.ones(9)]
+  made.remember([Lesson(*(row.astype(np.float32) for row in lesson), "success", False)])
+  seen = {name: random.randn(*shape) for name, shape in more.items()}
+  np.testing.assert_allclose(
+    made.policy(task, {}, {}).begin()(seen), taken.begin()(seen), atol=1e-5
+  )
+  with pytest.raises(ValueError, match="observes held, hook_front, target, through, expected held"):
+    older.take(made.policy(task, {}, {}))
+
+
+def test_what_was_seen_is_remembered_longer_than_what_is_learned_at_once():
+  names, count = ("pitch", "yaw"), 300
+  task = SimpleNamespace(name="any/easy", components=names, control_timestep=0.02)
+  made = networks.Networks({"told": (1,)}, names, 8, (8,), 0.1, 0, "cpu")
+  lessons = []
+  for sign in 4 * (-1.0, 1.0):  # what is told at first is to be done all along
+    seen, meant = np.zeros((count, 1), np.float32), np.full((count, 2), 0.25 * sign, np.float32)
+    seen[:5] = sign
+    rows = seen, meant, meant, np.ones(count, bool), meant[:, 0]
+    lessons.append(Lesson(*rows, "success", False))
+  made.learn(lessons, 300)
+  for lesson in lessons:
+    act = made.policy(task, {}, {}).begin()
+    done = [act({"told": row}).copy() for row in lesson.seen]
+    np.testing.assert_allclose(done[100:], lesson.meant[100:], atol=0.1)
+
+
 def test_what_is_held_from_the_start_is_no_change_to_learn():
   names, first = ("pitch", "jaw"), (0.0, 0.5)
   task = SimpleNamespace(name="any/easy", components=names, control_timestep=0.02)

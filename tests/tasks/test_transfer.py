@@ -78,6 +78,12 @@ def test_two_rings_there_and_back():
     timestep = env.step(act(timestep))
     total += timestep.reward
     hands.add((env.task.done, env.task.right_holds, env.task.left_holds))
+    if env.task.right_holds and env.task.left_holds:
+      # The wire is between the jaws of the hand that takes it, short of their tip, and across.
+      seen = timestep.observation
+      np.testing.assert_allclose(seen["hand_target"], [0.0, 0.0, 0.0036], atol=0.0015)
+      np.testing.assert_allclose(seen["hand_circle"], [0.0, 0.0, 1.0], atol=0.2)
+      np.testing.assert_allclose(np.abs(seen["hand_along"]), [0.0, 1.0, 0.0], atol=0.2)
   assert env.task.outcome == "success" and total == pytest.approx(1.0)
   assert env.task.regrasps == 2.0 and env.task.worst == 0.0
   # Each ring is done in the other hand, and both hold the needle in between.

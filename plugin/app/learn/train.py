@@ -37,7 +37,7 @@ _TRAINED = "trained"  # the teacher that comes with an exercise
 _SAVE = 60.0  # seconds between checkpoints
 ROUNDS = 6  # of lessons, at most
 _LESSONS = 96  # of a round
-UPDATES = 700  # of the networks, after each round
+UPDATES = 1000  # of the networks, after each round
 JUDGE = 5  # iterations between looks at the policy without spread
 _LICENCE = """SPDX-License-Identifier: Apache-2.0
 

@@ -17,7 +17,9 @@ from ...core.base import Physics, Task
 from ...core.performer import Performer, Script
 from ...core.rules import (
   FAR,
+  Vector,
   drop,
+  in_hand,
   length,
   needle_place,
   other_pinch,
@@ -76,6 +78,14 @@ class Hands:
   regrasps: float
 
 
+class Taking(Hands):
+  """State of hands that take it from each other."""
+
+  hand_target: Vector  # in the frame of the hand that is to take it: where it may be taken [m]
+  hand_circle: Vector  # axis of its circle
+  hand_along: Vector  # way along it
+
+
 # The rules.
 
 
@@ -91,6 +101,25 @@ def away(s, place):
   for k in range(PIECES + 1):
     least = min(least, length(arc(s, float(k) / float(PIECES)) - place))
   return least
+
+
+def in_jaws(s, o, hand, share, step):
+  """Finds the needle in the frame of a hand that is to take it; returns o.
+
+  Args:
+    s: the world
+    o: see `Taking`
+    hand: 0 for the right one, 1 for the left one
+    share: where it may be taken
+    step: a small share, by its sign the way along the needle
+  """
+  place = arc(s, share)
+  axis = needle_place(s, vector(0.0, 0.0, 1.0)) - needle_place(s, vector(0.0, 0.0, 0.0))
+  o.hand_target = in_hand(s, hand, place)
+  o.hand_circle = in_hand(s, hand, place + axis) - o.hand_target
+  along = in_hand(s, hand, arc(s, share + step)) - o.hand_target
+  o.hand_along = along / length(along)
+  return o
 
 
 def right_grasp(s):

@@ -16,7 +16,10 @@ circle [-]; `middle` (3,), from the entry mark to the middle of that circle [m];
 `stitches` (1,), how many are placed; `pierced` (1,), holes of the next one that are made; `through`
 (1,), share of the needle that is through the last hole [-]; `gap` (1,), of the cut at its widest
 [m]; `tight` (1,), largest tension of the thread [N]; `right_holds` (1,), `left_holds` (1,), whether
-a hand holds the needle.
+a hand holds the needle. In the frame of the hand that is to take the needle, the right one where
+the left one alone holds it: `hand_target` (3,), from its tip to where it may take it [m];
+`hand_circle` (3,), axis of the needle's circle [-]; `hand_along` (3,), way along the needle there,
+to its tip [-].
 
 Progress: 0.7 of it are the stitches to do, each 0.3 * closeness of the tip to the first mark; 0.4 +
 0.2 * closeness to the second one once it is in; 0.6 + 0.4 * through once it is through both. The
@@ -76,8 +79,8 @@ from .needles import (
   RADIUS,
   RIGHT,
   WALL,
-  Hands,
   Stitching,
+  Taking,
   approach,
   arc,
   arrive,
@@ -85,6 +88,7 @@ from .needles import (
   come,
   grasped,
   half_angle,
+  in_jaws,
   left_grasp,
   let_go,
   lingers,
@@ -114,6 +118,8 @@ FIELD = Scene(
   organ="sheet", instrument="psm", second="psm", port=(-0.06, 0.1, 0.08),
   second_port=(0.06, 0.1, 0.08), camera=(0.0, 0.04, 0.105), nodes=480,
 )  # fmt: skip
+# Where on the needle the hands take it, as shares.
+_BACK, _FRONT = (0.5 + angle / math.pi for angle, _ in (RIGHT, LEFT))
 _MASS, _SLOTS = 0.004, 160  # of the wall [kg], and of its window
 # Of the expert: how high the needle is brought over the wall [m], and what it pulls with [N].
 _HIGH, _PULL = 0.012, 0.7
@@ -143,7 +149,7 @@ def hard(**kwargs):
   return Running(FIELD, **{"placed": 1, "tolerance": 0.0015, "jitter": 0.003, **kwargs})
 
 
-class State(Hands):
+class State(Taking):
   """State of a world."""
 
   tolerance: float  # how far holes may be from their marks [m]
@@ -255,7 +261,8 @@ def observe(s, o):
   o.middle = middle - start
   o.stitches = float(o.done)
   o.pierced = float(max(o.holes - 2 * o.done, 0))
-  return o
+  left = o.left_holds > o.right_holds
+  return in_jaws(s, o, 0 if left else 1, _BACK if left else _FRONT, 0.01)
 
 
 def mark(s, o, k):
@@ -271,7 +278,7 @@ class Running(Stitching):
     advance,
     observe,
     ("target", "way", "circle", "middle", "stitches", "pierced", "through", "gap", "tight",
-     "right_holds", "left_holds"),
+     "right_holds", "left_holds", "hand_target", "hand_circle", "hand_along"),
     metrics={"peak_traction": "pulled", "bite_depth": "deepest", "regrasps": "regrasps",
              "final_gap": "gap", "peak_tension": "tightest", "tearing": "torn"},
     columns={"traction": "pull", "bite": "deepest", "regrasped": "regrasps", "gap": "gap",

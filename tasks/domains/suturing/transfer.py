@@ -9,7 +9,8 @@ end of the needle that goes first [m]; `trail` (3,), to the other end; `circle` 
 needle's circle [-]; `way` (3,), way through the ring [-]; `target` (3,), from the tip of the hand
 that is to take the needle to where the arc is 25 degrees from its first end [m]; `through` (1,),
 share of the needle that is through [-]; `right_holds` (1,), `left_holds` (1,), whether a hand holds
-the needle.
+the needle. In the frame of the hand that is to take it: `hand_target` (3,), what `target` is [m];
+`hand_circle` (3,), what `circle` is [-]; `hand_along` (3,), way along the needle there [-].
 
 Progress: (done + part) / number, part being 0.25 * closeness of the first end to the ring; once it
 is through, 0.25 + 0.4 * through, and 0.1 more when the taking hand holds the needle, 0.1 when it
@@ -57,9 +58,9 @@ from .needles import (
   QUARTER,
   RADIUS,
   TURNED,
-  Hands,
   Needlework,
   Pose,
+  Taking,
   apart,
   arc,
   carry,
@@ -68,6 +69,7 @@ from .needles import (
   grasp,
   grasped,
   height,
+  in_jaws,
   leave,
   left_grasp,
   lingers,
@@ -115,7 +117,7 @@ def hard(**kwargs):
   return Transfer(FIELD, **kwargs)
 
 
-class State(Hands):
+class State(Taking):
   """State of a world."""
 
   size: float  # of the rings: inner radius [m]
@@ -212,9 +214,9 @@ def observe(s, o):
   o.trail = from_first(s, o, 1.0) - middle
   o.circle = needle_place(s, vector(0.0, 0.0, 1.0)) - needle_place(s, vector(0.0, 0.0, 0.0))
   o.way = -o.ways[now(o)] if back(o) else 1.0 * o.ways[now(o)]
-  hand = tip(s) if back(o) else other_tip(s)
-  o.target = from_first(s, o, TAKEN) - hand
-  return o
+  o.target = from_first(s, o, TAKEN) - (tip(s) if back(o) else other_tip(s))
+  hand, share = 0 if back(o) else 1, TAKEN if back(o) else 1.0 - TAKEN
+  return in_jaws(s, o, hand, share, 0.01 if back(o) else -0.01)
 
 
 def mark(s, o, k):
@@ -230,7 +232,8 @@ class Transfer(Needlework):
     State,
     advance,
     observe,
-    ("lead", "trail", "circle", "way", "target", "through", "right_holds", "left_holds"),
+    ("lead", "trail", "circle", "way", "target", "through", "right_holds", "left_holds",
+     "hand_target", "hand_circle", "hand_along"),
     metrics={"regrasps": "regrasps", "ring_contact": "scraping", "peak_ring_force": "worst"},
     columns={"regrasped": "regrasps", "ring_time": "scraping", "ring_force": "worst"},
     mark=mark,
