@@ -30,7 +30,8 @@ _ENTRIES = 4  # weights of a vertex
 _THRESHOLD = {"cpu": 100.0, "cuda": 300.0}
 # Nodes from which they may: what acts on one node of a small mesh reaches the others in few
 # iterations. With 280 to 1025 nodes and condition numbers of 256 to 7500 block Jacobi took 2 to 6
-# times the cycles, in 0.5 to 0.9 of their time; a stiff shell of 1446 nodes takes 0.6 to 0.8 with them.
+# times the cycles, in 0.5 to 0.9 of their time; with cycles a stiff shell of 1446 nodes takes 0.6
+# to 0.8 of that of block Jacobi.
 _FEWEST = 1200
 # Interval of the smoother, as greatest eigenvalue of D^-1 A and its ratio to the lower end, by
 # degree. A membrane's is 2.3 on good meshes, at most 3 (three corners an element), and bending
