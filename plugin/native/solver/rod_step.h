@@ -18,7 +18,7 @@ namespace palpate {
 constexpr int DOFS = 6;  // of the two nodes that a row reaches
 // Newton's method ends when no node moves by more than this share of the radius: by CLOSE where the cost fell as was
 // expected, up to a share FORESEEN, since much less is then left to go, or else by STALLED.
-constexpr double CLOSE = 1e-3, STALLED = 1e-5, FORESEEN = 0.1;
+constexpr double CLOSE = 1e-4, STALLED = 1e-5, FORESEEN = 0.1;
 constexpr double SLOPE = 1e-4;  // of a step's decrease, the least (Armijo)
 constexpr double ROUNDED = 1e-15;  // of the cost, what is less than its last digits
 constexpr int HALVINGS = 30;
