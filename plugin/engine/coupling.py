@@ -8,6 +8,7 @@ the forces that act in it, and gains no more energy than they give. The inertia 
 then is a guess of what a tool meets, and follows the organ's answers.
 """
 
+import collections
 import ctypes
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -242,13 +243,11 @@ class Ties:
           each[phase]()
 
 
-_ties: dict[tuple[int, int], Ties] = {}
+_ties: dict[tuple[int, int], Ties] = collections.defaultdict(Ties)
 
 
 def ties(data: int, flex: int) -> Ties:
   """Returns what holds the thread of a flex in an mjData."""
-  if (data, flex) not in _ties:
-    _ties[data, flex] = Ties()
   return _ties[data, flex]
 
 

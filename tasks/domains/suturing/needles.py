@@ -81,6 +81,7 @@ class Hands:
 class Taking(Hands):
   """State of hands that take it from each other."""
 
+  circle: Vector  # axis of the needle's circle
   hand_target: Vector  # in the frame of the hand that is to take it: where it may be taken [m]
   hand_circle: Vector  # axis of its circle
   hand_along: Vector  # way along it
@@ -108,15 +109,14 @@ def in_jaws(s, o, hand, share, step):
 
   Args:
     s: the world
-    o: see `Taking`
+    o: see `Taking`; its circle is known
     hand: 0 for the right one, 1 for the left one
     share: where it may be taken
     step: a small share, by its sign the way along the needle
   """
   place = arc(s, share)
-  axis = needle_place(s, vector(0.0, 0.0, 1.0)) - needle_place(s, vector(0.0, 0.0, 0.0))
   o.hand_target = in_hand(s, hand, place)
-  o.hand_circle = in_hand(s, hand, place + axis) - o.hand_target
+  o.hand_circle = in_hand(s, hand, place + o.circle) - o.hand_target
   along = in_hand(s, hand, arc(s, share + step)) - o.hand_target
   o.hand_along = along / length(along)
   return o

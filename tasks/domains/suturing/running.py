@@ -173,7 +173,6 @@ class State(Taking):
   torn: float  # how far a hole has torn at most [m]
   target: Vector
   way: Vector
-  circle: Vector
   middle: Vector
   stitches: float
   pierced: float

@@ -132,7 +132,6 @@ class State(Taking):
   worst: float  # largest force on them [N]
   lead: Vector
   trail: Vector
-  circle: Vector
   way: Vector
   target: Vector
 
@@ -214,9 +213,11 @@ def observe(s, o):
   o.trail = from_first(s, o, 1.0) - middle
   o.circle = needle_place(s, vector(0.0, 0.0, 1.0)) - needle_place(s, vector(0.0, 0.0, 0.0))
   o.way = -o.ways[now(o)] if back(o) else 1.0 * o.ways[now(o)]
-  o.target = from_first(s, o, TAKEN) - (tip(s) if back(o) else other_tip(s))
-  hand, share = 0 if back(o) else 1, TAKEN if back(o) else 1.0 - TAKEN
-  return in_jaws(s, o, hand, share, 0.01 if back(o) else -0.01)
+  if back(o):
+    o.target = arc(s, TAKEN) - tip(s)
+    return in_jaws(s, o, 0, TAKEN, 0.01)
+  o.target = arc(s, 1.0 - TAKEN) - other_tip(s)
+  return in_jaws(s, o, 1, 1.0 - TAKEN, -0.01)
 
 
 def mark(s, o, k):
