@@ -14,10 +14,11 @@ share the worlds: `--device cuda:0+cuda:1`.
 
 lays a silk 3-0 of so many nodes, 2.5 mm apart, over the sphere in place of the ball.
 
-    palpate bench batch --device cuda:0 --nodes 400 --worlds 256 --bend 0 --fls
+    palpate bench batch --device cuda:0 --worlds 256 --bend 0 --fls 0.1 3 6.5 8.5
 
-steps the scene of FLS's knots: a slit drain, a thread that is sewn through it with a throw laid
-over it, a needle, and two needle drivers with wrists that hold still.
+steps the scene of FLS's knots from states of an expert's episode of `suture/knot_easy`, so many
+seconds after its start: the held thread settles, is wound, its short tail is taken, and the throw
+is drawn down. 20 steps are timed, in which the needle drivers hold still.
 """
 
 from __future__ import annotations
@@ -36,12 +37,14 @@ import warp as wp
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate.models.meshing import grid
-from palpate.tasks.core.scenes import Scene
-from palpate.tasks.domains.suturing import drain, extracorporeal
+from palpate.tasks import suite
+from palpate.tasks.core import performer
+from palpate.tasks.core.stage import STATE
+from palpate.tasks.domains.suturing import knot
 
 RADIUS, BALL, H, DEEP = 0.05, 0.006, 1e-3, 0.006
 EDGE = 2.5e-3  # of a thread [m]
-STEPS = 150  # of the press, and of what is timed together
+STEPS, FEW = 150, 20  # of the press, and of what is timed together; of FLS's knots
 
 
 def scene(nodes: int, bend: float, condim: int, tolerance: float, thread: int = 0) -> mujoco.MjSpec:
@@ -69,20 +72,31 @@ def lay(spec: mujoco.MjSpec, count: int):
   palpate.add_thread(spec, np.stack([r * np.sin(angle), 0 * s, r * np.cos(angle) - below], axis=1))
 
 
-def knots(nodes: int) -> tuple[mujoco.MjSpec, mujoco.MjData, int]:
-  """Returns the scene of FLS's knots, how it starts, and the nodes of its thread."""
-  ports = {"port": (-0.06, 0.04, 0.13), "second_port": (0.06, 0.04, 0.13)}
-  post, tail = extracorporeal.strands(extracorporeal.HIGH, 1)
-  line = np.concatenate([post[::-1], tail])
-  along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
-  at = np.arange(0.0, along[-1], extracorporeal.EDGE)
-  line = np.stack([np.interp(at, along, column) for column in line.T], axis=1)
-  spec = drain.build(Scene(instrument="psm", second="psm", nodes=nodes, **ports), line)
-  model = spec.copy().compile()
-  data = mujoco.MjData(model)
-  mujoco.mj_forward(model, data)
-  drain.sew(palpate.Organ(model, data, "organ"), line)
-  return spec, data, len(line)
+def knots(seconds: float):
+  """Returns the scene of FLS's knots, and what puts worlds where an expert's episode is then."""
+  kwargs = {"random": 0, "surroundings": "none"}
+  environment = suite.load("suture", "knot_easy", task_kwargs=kwargs)
+  expert, step = performer.make(environment, seed=0), environment.reset()
+  while environment.physics.time() < seconds:
+    step = environment.step(expert(step))
+  task, physics = environment.task, environment.physics
+  state = np.empty(mujoco.mj_stateSize(physics.model.ptr, STATE))
+  mujoco.mj_getState(physics.model.ptr, physics.data.ptr, state, STATE)
+
+  def begin(batch):
+    data = mujoco.MjData(batch.model)
+    mujoco.mj_setState(batch.model, data, state, STATE)
+    mujoco.mj_forward(batch.model, data)
+    batch.start(data)
+    batch.reset()
+    batch.ctrl = np.tile(data.ctrl.astype(np.float32), (batch.nworld, 1))
+    (thread,) = batch.threads.values()
+    for k, hand in enumerate(physics.hands):
+      place = task.anchors[k] + batch.model.site(f"{hand.prefix}tip").pos
+      same = (np.full(batch.nworld, task.held[k]), np.tile(place, (batch.nworld, 1)))
+      thread.hold(f"{hand.prefix}{thread.name}", *same, np.full(batch.nworld, task.firm[k]))
+
+  return task.dressed(task.variants[0]), begin
 
 
 def depths(nworld: int) -> np.ndarray:
@@ -117,22 +131,26 @@ def measure(
   tolerance: float,
   repeat: bool,
   thread: int = 0,
-  fls: bool = False,
+  fls: float | None = None,
 ) -> dict:
   """Returns what steps of a batch take."""
-  spec, data = scene(nodes, bend, condim, tolerance, thread), None
-  if fls:
-    spec, data, thread = knots(nodes)
+  if fls is None:
+    spec, begin = scene(nodes, bend, condim, tolerance, thread), None
+  else:
+    spec, begin = knots(fls)
   names = device.split("+")
   start, target = time.perf_counter(), wp.get_device(names[0] if "cuda" in names[0] else "cpu")
   free = target.free_memory if target.is_cuda else 0
   where = names if len(names) > 1 else device
   batch = palpate.batch.make(spec, nworld, where, nodes=slots, deterministic=repeat)
   made, rms = time.perf_counter() - start, float("nan")
-  if data:
-    batch.start(data)
-    batch.reset()
-  if nworld <= 1024 and condim == 1 and not thread:
+  steps = STEPS
+  if begin:
+    steps, thread = FEW, len(next(iter(batch.threads.values())).xpos.numpy()[0])
+    begin(batch)
+    batch.step(FEW)
+    begin(batch)
+  elif nworld <= 1024 and condim == 1 and not thread:
     found, expected = press(batch, record=True), alone(scene(nodes, bend, condim, tolerance))
     rms = float(np.sqrt(np.mean((found - expected) ** 2)) / np.abs(expected).max())
   else:
@@ -141,12 +159,12 @@ def measure(
   here = nworld / len(names)
   used = (free - target.free_memory) / here if target.is_cuda else float("nan")
   before = time.perf_counter()
-  for k in range(STEPS // 10):
+  for k in range(steps // 10):
     if batch.model.nu == 1:
       batch.ctrl = -(depths(nworld) - 0.001 * (k % 2))[:, None]
     batch.step(10)
   wp.synchronize()
-  step = (time.perf_counter() - before) / (STEPS // 10 * 10)
+  step = (time.perf_counter() - before) / (steps // 10 * 10)
   tissue = batch.organ("organ")
   residual, iterations = tissue.residual.numpy(), tissue.iterations.numpy()
   force = tissue.contact_force.numpy().sum(axis=1)[:, 2] if nworld <= 4096 else [float("nan")]
@@ -212,25 +230,33 @@ def arguments(parser: argparse.ArgumentParser):
   add("--tolerance", type=float, default=1e-3)
   add("--slots", type=int, nargs="+", help="nodes that the ball may touch, one a size or for all")
   add("--thread", type=int, default=0, help="nodes of a thread in place of the ball")
-  add("--fls", action="store_true", help="the scene of FLS's knots in place of the sphere")
+  add(
+    "--fls",
+    type=float,
+    nargs="+",
+    metavar="SECONDS",
+    help="the scene of FLS's knots, so long into an expert's episode",
+  )
   add("--repeat", action="store_true", help="runs that repeat to the bit whatever the GPU does")
 
 
 def stages(args: argparse.Namespace) -> list[list[Case]]:
   """Returns a case a size, number of worlds, and kind of tissue and contact."""
-  keys = {name: getattr(args, name) for name in ("device", "tolerance", "repeat", "thread", "fls")}
+  keys = {name: getattr(args, name) for name in ("device", "tolerance", "repeat", "thread")}
+  sizes = [knot.FIELD.nodes] if args.fls else args.nodes
   slots = args.slots or [None]
-  slots = dict(zip(args.nodes, slots * (len(args.nodes) // len(slots)), strict=True))
+  slots = dict(zip(sizes, slots * (len(sizes) // len(slots)), strict=True))
   worlds = args.worlds or ([8] if args.device == "cpu" else [1024, 4096, 16384])
   kind = "-repeat" * args.repeat + f"-thread{args.thread}" * bool(args.thread)
-  kind += "-fls" * args.fls
   many = f"-x{args.device.count('+') + 1}" * ("+" in args.device)
-  cases = [
-    {"case": f"{n}-{w}-{bend:g}-{c}-{slots[n] or 0}{kind}{many}", "nodes": n, "nworld": w}
-    | {"bend": bend, "condim": c, "slots": slots[n]}
-    | keys
-    for bend, c, n, w in itertools.product(args.bend, args.condim, args.nodes, worlds)
-  ]
+  cases = []
+  for bend, c, n, w, t in itertools.product(
+    args.bend, args.condim, sizes, worlds, args.fls or [None]
+  ):
+    at = "" if t is None else f"-fls{t:g}"
+    name = f"{n}-{w}-{bend:g}-{c}-{slots[n] or 0}{kind}{at}{many}"
+    own = {"nodes": n, "nworld": w, "bend": bend, "condim": c, "slots": slots[n], "fls": t}
+    cases.append({"case": name} | own | keys)
   return [cases[:1] if args.short else cases]
 
 
