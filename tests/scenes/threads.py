@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import palpate
+import scipy.spatial
 from palpate.tasks.core.scenes import ORGAN, Scene
 from palpate.tasks.domains.suturing import drain
 from palpate.tasks.metrics import knots
@@ -62,6 +63,43 @@ def nearest(points, between=2):
   return far.min()
 
 
+def passes(before, after, parts=4):
+  """Returns how many pairs of a thread's edges go through each other between two steps.
+
+  Nodes move on straight lines. Edges cross where the volume that they span changes its sign while
+  the nearest points of their lines are within both. After a long step this finds too many: the
+  thread may have gone round.
+
+  Args:
+    before: nodes [m]  (n, 3)
+    after: the same nodes a step later [m]  (n, 3)
+    parts: of the step, in each of which a pair crosses at most once
+  """
+  middle = 0.5 * (before[1:] + before[:-1])
+  far = np.linalg.norm(np.diff(before, axis=0), axis=1).max()
+  far += 2 * np.linalg.norm(after - before, axis=1).max()
+  pairs = scipy.spatial.cKDTree(middle).query_pairs(1.1 * far, output_type="ndarray")
+  i, j = pairs[pairs[:, 1] - pairs[:, 0] > 1].T
+
+  def spanned(share):
+    x = before + share * (after - before)
+    d, e, r = x[i + 1] - x[i], x[j + 1] - x[j], x[j] - x[i]
+    n = np.cross(d, e)
+    with np.errstate(invalid="ignore"):  # parallel
+      at = [(np.cross(r, along) * n).sum(axis=1) / (n * n).sum(axis=1) for along in (e, d)]
+    return (n * r).sum(axis=1), *at
+
+  crossed, old = np.zeros(len(i), bool), spanned(0.0)
+  for share in np.linspace(0.0, 1.0, parts + 1)[1:]:
+    new = spanned(share)
+    changes = (old[0] > 0) != (new[0] > 0)
+    when = old[0] / np.where(changes, old[0] - new[0], 1.0)
+    at = np.array([a + when * (b - a) for a, b in zip(old[1:], new[1:], strict=True)])
+    crossed |= changes & ((at > 0) & (at < 1)).all(axis=0)
+    old = new
+  return int(crossed.sum())
+
+
 def load(points, hands=(), h=1e-3, damping=2.0, **config):
   """Returns a thread, some nodes of which are in hands: 20 g on a slide with a motor each.
 
@@ -100,24 +138,27 @@ def add_hands(spec, thread, points, hands, damping):
 
 
 def by_hands(points, force, steps, step=mujoco.mj_step, **config):
-  """Returns a thread whose ends hands have pulled apart, and whether none of it came before a hand.
+  """Returns a thread whose ends hands have pulled apart, and how it went.
 
-  There an open thread is closed for its knot: what goes by a hand changes that, and rightly so.
+  Returns:
+    the thread; whether none of it came before a hand, where an open thread is closed for its knot:
+    what goes by a hand changes that, and rightly so; its `passes`
   """
   axis = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
   model, data, thread = load(points, ((0, -axis), (len(points) - 1, axis)), **config)
-  places, clear = thread.positions, True
+  places, clear, through = thread.positions, True, 0
   for k in range(steps):
     data.ctrl[:] = force * min(1.0, k / 50)
     step(model, data)
     before, places = places, thread.positions
+    through += passes(before, places)
     moved = np.linalg.norm(places - before, axis=1).max()
     for end, way in ((places[0], -axis), (places[-1], axis)):
       ahead = (places - end) @ way
       off = np.linalg.norm(places - end - ahead[:, None] * way, axis=1)
       edge = np.linalg.norm(points[1] - points[0])
       clear &= not ((ahead > edge) & (off < 2 * moved + edge)).any()
-  return thread, clear
+  return thread, clear, through
 
 
 def throws(turns, radius, segment, ear=5e-3, arm=5e-3):
