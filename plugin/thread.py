@@ -55,8 +55,8 @@ def add_thread(
     contact: attributes of <contact> that differ from the defaults
     bead: radius of a bead at the last node, such as a clip or a knot, which has no contacts but
       does not pass a narrower hole of a needle; 0 for none [m]
-    **config: keys of a rod that replace the material's: young, poisson, bend, twist, strength,
-      drag
+    **config: keys of a rod, some of which replace the material's: young, poisson, bend, twist,
+      strength, drag, refine
 
   Returns:
     The flex, for instance to give it a material.
@@ -171,8 +171,10 @@ class Thread:
     which = np.arange(len(organ.rest)) if nodes is None else np.asarray(nodes)
     if abs(np.diff(which)).max(initial=1) != 1 or abs(which[-1] - which[0]) != len(which) - 1:
       raise ValueError(f"thread {self.name!r}: nodes is {nodes}, expected consecutive ones")
-    length = np.linalg.norm(np.diff(organ.rest[which], axis=0), axis=1)
-    length += tension / self._space.constants["stretch"][np.minimum(which[1:], which[:-1])]
+    if nodes is None:
+      self._space.plugin_state[:] = 0.0
+    edge, measured = np.minimum(which[1:], which[:-1]), self._space.measured()
+    length = measured["length"][edge] + tension / measured["stretch"][edge]
     last = line[-1] - line[-2]
     line = np.concatenate([line, line[-1:] + length.sum() / np.linalg.norm(last) * last])
     places, k = [line[0]], 0
@@ -182,8 +184,6 @@ class Thread:
       way, off = line[k + 1] - line[k], line[k] - places[-1]
       a, b, c = way @ way, way @ off, off @ off - far**2
       places.append(line[k] + (np.sqrt(b * b - a * c) - b) / a * way)
-    if nodes is None:
-      self._space.plugin_state[:] = 0.0
     at = organ.qposs.reshape(-1, 3)[which]
     local = (places - organ.origin) @ organ.frame - organ.rest[which]
     self.data.qpos[at] = self.model.qpos0[at] + local
@@ -229,9 +229,14 @@ class Thread:
     return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
   @property
+  def rest_lengths(self) -> np.ndarray:
+    """Rest length of each edge [m], (nnode - 1,); the key `refine` changes it."""
+    return self._space.measured()["length"][:-1].copy()
+
+  @property
   def tension(self) -> np.ndarray:
     """Tension of each edge [N], (nnode - 1,); negative where it is compressed."""
-    return rod.tension(self._space.constants, self._local(), self.broken)
+    return rod.tension(self._space.measured(), self._local(), self.broken)
 
   @property
   def twist(self) -> np.ndarray:
@@ -241,7 +246,7 @@ class Thread:
   @property
   def energy(self) -> float:
     """Elastic energy [J]."""
-    return rod.energy(self._space.constants, self._local(), self.twist, self.broken)
+    return rod.energy(self._space.measured(), self._local(), self.twist, self.broken)
 
   @property
   def broken(self) -> np.ndarray:

@@ -302,19 +302,30 @@ def lay(f: Laid):
     f.qvel[w, f.dofadr[i] + c] = 0.0
 
 
+@struct
+class Pulled:
+  """Edges of a thread."""
+
+  now: doubles("nworld", "nnode", 3)  # see `rods.WorldRods`
+  springs: doubles(2, "nnode")  # stiffness [N/m] and length at rest [m], as nodes begin
+  moved: doubles("nworld", "nmoved")  # see `layout.RodState`
+  broken: doubles("nworld", "nnode")
+
+
 @wp.kernel(enable_backward=False)
-def pull_rod(
-  now: wp.array3d[wp.float64], springs: wp.array2d[wp.float64], broken: wp.array2d[wp.float64],
-  out: wp.array2d[float],
-):  # fmt: skip
+def pull_rod(f: Pulled, out: wp.array2d[float]):
   """Writes the tension of a thread's edges."""
   w, i = wp.tid()
   square = wp.float64(0.0)
   for c in range(3):
-    edge = now[w, i + 1, c] - now[w, i, c]
+    edge = f.now[w, i + 1, c] - f.now[w, i, c]
     square += edge * edge
-  whole = wp.float64(1.0) - broken[w, i]
-  out[w, i] = float(whole * springs[0, i] * (wp.sqrt(square) - springs[1, i]))
+  whole = wp.float64(1.0) - f.broken[w, i]
+  stretch, length = wp.float64(f.springs[0, i]), wp.float64(f.springs[1, i])
+  if f.moved.shape[1] > 0:  # nodes move along it
+    length += f.moved[w, i + 1] - f.moved[w, i]
+    stretch *= f.springs[1, i] / length
+  out[w, i] = float(whole * stretch * (wp.sqrt(square) - length))
 
 
 @wp.kernel(enable_backward=False)

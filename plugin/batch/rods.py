@@ -99,21 +99,24 @@ class Thread(thread.Thread):
     moving = np.flatnonzero(organ.free)[:, None]
     own_dof[dofs[organ.free]] = 3 * moving + np.arange(3)
     mass = space.mass
-    shared = space.constants | rods.settings(organ, space.friction) | {"mass": mass}
+    shared = space.constants | rods.settings(organ, space.friction) | {"mass": mass, "body": mass}
     shared["newton"] = min(shared["newton"], _ITERATIONS)
-    spans = layout.spans(layout.RodState, {"nvert": n, "nv": bare.nv})
+    spans = layout.spans(layout.RodState, organ.sizes(bare.nv))
     self.own = own = {
       name: wp.zeros((nworld, span.stop - span.start), dtype=wp.float64, device=device)
       for name, span in spans.items()
+      if span.stop > span.start
     }
     self._broken = own["broken"]
+    self.ties = Ties(nworld, device)
+    if organ.config.refine:
+      self.ties.track(n)
     scratch = rods.scratch(organ, bare.nv).items()
     each = {name: _rows(Rod, name, start, nworld, device) for name, start in scratch}
     self.iterations = each["status"]
-    self.ties = Ties(nworld, device)
     each |= self.ties.arrays
     values: dict[str, Any] = dict(
-      rods=_stack(shared | each | {"own": own}, nworld, device),
+      rods=_stack(shared | each | {"own": {"moved": np.zeros(0)} | own}, nworld, device),
       nv=bare.nv,
       flex=mujoco.mj_name2id(bare, mujoco.mjtObj.mjOBJ_FLEX, organ.name),
       sparse=int(m.is_sparse),
@@ -138,7 +141,9 @@ class Thread(thread.Thread):
     self.fields: Any = fill(WorldRods, device, arrays_of(WorldRods, m, d) | values)
     self._origin = wp.vec3(*organ.origin)
     springs = np.array([space.constants[name] for name in ("stretch", "length")])
-    self._springs = wp.array(springs, dtype=wp.float64, device=device)
+    moved = own.get("moved", np.zeros((nworld, 0)))
+    shown = {"now": self.fields.now, "springs": springs, "moved": moved, "broken": own["broken"]}
+    self._shown = fill(kernels.Pulled, device, shown)
 
   def load(self):
     """Loads the kernels, compiling them where the cache has none."""
@@ -182,7 +187,7 @@ class Thread(thread.Thread):
   @property
   def tension(self) -> wp.array:
     """Tension of each edge [N], (nworld, nnode - 1)."""
-    inputs = [self.fields.now, self._springs, self._broken, self._tension]
+    inputs = [self._shown, self._tension]
     wp.launch(kernels.pull_rod, dim=self._tension.shape, inputs=inputs, device=self._batch.device)
     return self._tension
 
@@ -266,7 +271,7 @@ class Thread(thread.Thread):
   def _own(self, data: mujoco.MjData):
     """Returns views of its part of the plugin state."""
     start = self._batch.model.plugin_stateadr[self.space.instance]
-    return rods.state_of(data.plugin_state[start:], len(self.declared.rest), self._batch.model.nv)
+    return rods.state_of(data.plugin_state[start:], self.declared, self._batch.model.nv)
 
 
 class Rods:
@@ -296,6 +301,8 @@ class Rods:
   def aim(self):
     """Lets threads know what holds them, as a step begins."""
     for each in self.all.values():
+      if each.ties.moved is not None:
+        wp.copy(each.ties.moved, each.own["moved"])
       each.ties.aim()
 
   def begin(self):

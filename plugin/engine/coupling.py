@@ -215,6 +215,7 @@ class Ties:
     aims: by who holds it, what adds to these, and what follows once all have
     lead: lets the thread take its step before an organ's, given that's instance
     led: whether it has
+    moved: how far its nodes have moved along it [m]  (nworld, nnode); None where they do not
     again: lets it take that anew for the same, which has found the contacts again
   """
 
@@ -231,7 +232,15 @@ class Ties:
     self.aims: dict[Any, tuple[Callable[[], None], Callable[[], None]]] = {}
     self.lead: Callable[[int], None] = lambda instance: None
     self.led = False
+    self.moved: wp.array | None = None
     self.again: Callable[[int], None] = lambda instance: None
+
+  def track(self, nnode: int) -> wp.array:
+    """Returns `moved`, which the thread writes as its step begins."""
+    if self.moved is None:
+      shape = len(self._none), nnode
+      self.moved = wp.zeros(shape, dtype=wp.float64, device=self._none.device)
+    return self.moved
 
   def aim(self):
     """Fills the arrays."""

@@ -317,7 +317,13 @@ class RodState:
   pushed: doubles("nv")  # force on other bodies in the last step: known, and its constraints'
   accelerated: doubles("nv")  # their acceleration then
   broken: doubles("nvert")  # whether an edge has broken
+  moved: doubles("nmoved")  # how far each node has along the thread, see `solver/rod_refine.h` [m]
   signature: doubles(1)  # of the thread; 0 where it was set by hand [-]
+
+
+def rod_sizes(nvert: int, nv: int, refine: Any) -> dict[str, int]:
+  """Returns the sizes of `RodState` of a thread whose nodes move along it, or not."""
+  return {"nvert": nvert, "nv": nv, "nmoved": nvert if refine else 0}
 
 
 @struct

@@ -48,6 +48,7 @@ _WRITTEN = (
   *("row_kind", "row_node", "row_efc", "row_tree", "row_yields", "row_body"),
   *("row_value", "grip", "known", "speed"),
 )
+_MEASURED = "length", "along", "stretch", "bend", "drag", "mass"  # where nodes move along a thread
 _HUGE = 1e6  # more than any twist [rad]
 
 
@@ -64,7 +65,7 @@ class Rod:
   collides: int  # whether it meets itself
   most_pairs: int  # pairs of its edges that there is room for
   shortest: float  # length of its shortest edge [m]
-  longest: float  # of its longest one [m]
+  longest: float  # of its longest one, or what that may be [m]
   radius: float  # of its section [m]
   hardness: float  # of its section, of the barrier between edges [N/m]
   friction: float  # of the thread on itself
@@ -78,7 +79,15 @@ class Rod:
   mass: doubles("nnode")  # of a node [kg]
   drag: doubles("nnode")  # force against a node by its velocity [N s/m]
   spin: doubles("nnode")  # inertia of an edge about itself [kg m^2]
+  body: doubles("nnode")  # mass of its body [kg]
   held: ints("nheld")  # whether an unknown does not change
+  # Where nodes move along it:
+  refine: float  # length of edges where it touches itself; 0: none do [m]
+  mean: float  # length of an edge, by nodes [m]
+  axial: float  # E A [N]
+  flexural: float  # E I [N m^2]
+  viscous: float  # drag by length and velocity [N s/m^2]
+  drawn: doubles("nnode")  # rest length up to a node as these begin [m]
   # A step:
   start: doubles("nnode", 3)  # place as it begins, in the slides' axes [m]
   vel: doubles("nnode", 3)  # velocity then [m/s]
@@ -192,6 +201,10 @@ class Declaration:
     """Marks plugin states of this thread; over 2^50."""
     return float(2**50 + zlib.crc32(self.rest.tobytes() + self.free.tobytes()))
 
+  def sizes(self, nv: int) -> dict[str, int]:
+    """Returns the sizes of its `RodState` among nv dofs."""
+    return layout.rod_sizes(len(self.rest), nv, self.config.refine)
+
   @property
   def dofs(self) -> np.ndarray:
     """Degrees of freedom of the moving vertices."""
@@ -201,6 +214,11 @@ class Declaration:
   def qposs(self) -> np.ndarray:
     """Where they are in qpos."""
     return (self.qposadr[self.free, None] + np.arange(3)).ravel()
+
+  @property
+  def length(self) -> np.ndarray:
+    """Lengths of the edges as they begin [m], (nvert - 1,)."""
+    return np.linalg.norm(np.diff(self.rest, axis=0), axis=1)
 
   @property
   def clamped(self) -> np.ndarray:
@@ -227,13 +245,15 @@ def read(model: int, instance: int) -> Declaration:
       "expected edges 0 1, 1 2, ... of two vertices or more"
     )
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[flex])
-  rod.check_edges(name, np.linalg.norm(np.diff(rest, axis=0), axis=1), radius)
+  length = np.linalg.norm(np.diff(rest, axis=0), axis=1)
+  rod.check_edges(name, length, radius)
   rod.check_apart(name, rest, radius, NEIGHBOURS * radius, 2 * CORE * radius)
   texts = declare.keys(model, instance)
   try:
     config = configuration.parse(name, texts, len(edge), closed=False)
   except ValueError as error:
     raise ValueError(str(error).replace("organ ", "thread ", 1)) from None
+  rod.check_refine(name, config, length, radius, ~(free[1:] | free[:-1]))
   dofadr, qposadr = declare.addresses(m, name, body, free)
   kind, aims, dim = (
     mjstruct.array(m, name) for name in ("flex_contype", "flex_conaffinity", "flex_dim")
@@ -283,15 +303,16 @@ def scratch(organ: Declaration, nv: int) -> dict[str, np.ndarray]:
   """Returns the fields of `Rod` that a step of a thread among nv dofs writes."""
   n = len(organ.rest)
   most = n + _MOST_BODIES + organ.most_vertices
+  names = (*_WRITTEN, *(_MEASURED if organ.config.refine else ()))
   sizes = {"nnode": n, "nplace": most, "nunknown": 4 * most, "npair": _MOST_PAIRS * n}
   sizes |= {"nrow": _MOST_ROWS * n, "nentry": 2 * most * (4 * most + 1), "nv": nv}
-  return zeros(_WRITTEN, sizes | {"nword_node": -(-most // 32)}, (Rod,))
+  return zeros(names, sizes | {"nword_node": -(-most // 32)}, (Rod,))
 
 
-def state_of(state: np.ndarray, n: int, nv: int) -> Views:
-  """Returns `RodState` of a thread of n nodes, as views of its part of a plugin state."""
+def state_of(state: np.ndarray, organ: Declaration, nv: int) -> Views:
+  """Returns `RodState` of a thread, as views of its part of a plugin state."""
   array = wp.array(state, dtype=wp.float64, device="cpu", copy=False)
-  return Views(layout.carve(RodState, array, {"nvert": n, "nv": nv}))
+  return Views(layout.carve(RodState, array, organ.sizes(nv)))
 
 
 def _check(m, flex: int, name: str):
@@ -338,8 +359,8 @@ class Workspace:
     """Takes the arrays of an mjModel and of the mjData, and records the launches."""
     self._model = model
     m, organ = mjstruct.Model.from_address(model), self.organ
-    n, dofs = len(organ.rest), np.maximum(organ.dofadr, 0)[:, None] + np.arange(3)
-    sizes = {"nvert": n, "nv": m.nv}
+    dofs = np.maximum(organ.dofadr, 0)[:, None] + np.arange(3)
+    sizes = organ.sizes(m.nv)
     size = layout.size(RodState, sizes)
     self.state = coupling.plugin_state(model, self.data, self.instance, size)
     found = coupling.mujoco_arrays(model, self.data, Bound)
@@ -348,13 +369,14 @@ class Workspace:
     mass = mjstruct.view(m.body_mass, m.nbody)[organ.body]
     self.mass = mass = np.where(organ.free, mass, mass[organ.free].mean())
     self.friction = float(mjstruct.view(m.flex_friction, (m.nflex, 3))[organ.flex, 0])
-    self.constants = rod.constants(organ.rest, organ.radius, organ.config, mass, organ.clamped)
+    self.constants = self._constants(organ.length)
     self.own = layout.carve(RodState, self.state, sizes)
-    values = self.constants | settings(organ, self.friction) | scratch(organ, m.nv)
+    values = self.constants | settings(organ, self.friction) | {"mass": mass, "body": mass}
+    values |= scratch(organ, m.nv)
     self.ties = coupling.ties(self.data, organ.flex)
     self.ties.lead, self.ties.again = self._lead, self._again
-    values |= {"mass": mass, "own": self.own}
-    values |= {name: array[0] for name, array in self.ties.arrays.items()}
+    self._moved = self.ties.track(len(organ.rest)).numpy() if organ.config.refine else None
+    values |= {"own": self.own} | {name: array[0] for name, array in self.ties.arrays.items()}
     own = fill(Rod, "cpu", values)
     values = dict(
       rod=own,
@@ -389,6 +411,16 @@ class Workspace:
     self.seen.identity = mjstruct.Identity(model)
     self.seen.warning = mjstruct.warnings(self.data)
 
+  def _constants(self, length: np.ndarray) -> dict:
+    organ = self.organ
+    return rod.constants(length, organ.radius, organ.config, self.mass, organ.clamped)
+
+  def measured(self) -> dict:
+    """Returns `constants`, of edges as long as they are now."""
+    if not self.organ.config.refine:
+      return self.constants
+    return self._constants(np.diff(self.constants["drawn"] + self.own.moved.numpy()))
+
   @property
   def plugin_state(self) -> np.ndarray:
     """The thread's own numbers."""
@@ -405,6 +437,8 @@ class Workspace:
     if self.ties.led:
       self.ties.led = False
       return
+    if self._moved is not None:
+      self._moved[0] = self.own.moved.numpy()
     self.ties.aim()
     mjstruct.library().mj_fwdActuation(self._model, self.data)  # MuJoCo does so later
     self._before = self._passive[self._dofs]

@@ -65,13 +65,13 @@ def strand(host: Host, needle: int) -> dict[str, Any]:
 
   Returns:
     flex, or -1; body of each node (n,) and its place there [m] (n, 3); rest length and stiffness of
-    the edge to the next node (n, 2); frame (3, 3) and origin (3,) of its slides;
-    friction; how far from a hole it touches nothing; radius of the largest geom at its end, and its
-    own thickness [m]
+    the edge to the next node (n, 2), and whether nodes move along it; frame (3, 3) and origin (3,)
+    of its slides; friction; how far from a hole it touches nothing; radius of the largest geom at
+    its end, and its own thickness [m]
   """
   m, none = host.m, np.zeros((0, 3))
-  out = {"flex": -1, "node": none[:, 0], "local": none, "edges": none[:, :2], "friction": 0.0,
-         "close": 0.0, "bead": 0.0, "thick": 0.0}  # fmt: skip
+  out = {"flex": -1, "node": none[:, 0], "local": none, "edges": none[:, :2], "refine": False,
+         "friction": 0.0, "close": 0.0, "bead": 0.0, "thick": 0.0}  # fmt: skip
   first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
   size = mjstruct.view(m.geom_size, (m.ngeom, 3))[:, 0]
   body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
@@ -90,15 +90,16 @@ def strand(host: Host, needle: int) -> dict[str, Any]:
     where = declare.places(m, instance, flex, flexes.name(m, flex))
     rest, frame, origin = where[1], where[3], where[4]
     length = np.linalg.norm(np.diff(rest, axis=0), axis=1)
-    young = configuration.parse(flexes.name(m, flex), texts, len(length), closed=False).young
+    config = configuration.parse(flexes.name(m, flex), texts, len(length), closed=False)
     thick = float(mjstruct.view(m.flex_radius, m.nflex)[flex])
     section = np.pi * thick**2
-    edges = np.stack([length, np.asarray(young) * section / length], axis=1)
+    edges = np.stack([length, np.asarray(config.young) * section / length], axis=1)
     out = {
       "flex": flex,
       "node": body[mine].copy(),
       "local": mjstruct.view(m.flex_vert, (m.nflexvert, 3))[mine].copy(),
       "edges": np.concatenate([edges, edges[-1:]]),
+      "refine": config.refine > 0,
       "frame": frame,
       "origin": origin,
       "close": _BESIDE * (radius(host) + thick),

@@ -57,7 +57,7 @@ class Pierced:
   strand_flex: ints("nneedle")  # the thread's flex
   node: ints("nnode")  # body of a thread's node, from the swage on
   local: doubles("nnode", 3)  # place of the node there [m]
-  edges: doubles("nnode", 2)  # length at rest [m] and stiffness [N/m] of the edge to the next
+  edges: doubles("nmade", "nnode", 2)  # rest length [m] and stiffness [N/m] of the next edge
   ngeom: int  # geoms of the model
   lifted: ints("nworld", "nlift")  # what does not touch the organ, see `contacts.lifted`
   mesh: ints("nworld")  # which mesh a world has
@@ -92,12 +92,16 @@ class Held:
   tie_edge: ints("nworld", "ntie")
   tie_value: doubles("nworld", "ntie", len(TIE))
   span: doubles("nworld", 2)
+  drawn: doubles("nstrand", 2)  # its `Pierced.edges` as these begin
+  moved: doubles("nworld", "nstrand")  # how far its nodes have moved along it [m]
 
 
 _enter, _act, _keep = kernels(
   "forces/needles.h", Pierced, "enter_needles", "act_needles", "keep_needles"
 )
-_aim, _lift, _feel = kernels("forces/needles.h", Held, "aim_thread", "lift_thread", "feel_thread")
+_measure, _aim, _lift, _feel = kernels(
+  "forces/needles.h", Held, "measure_thread", "aim_thread", "lift_thread", "feel_thread"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -253,6 +257,10 @@ class Needles(Force):
     return out
 
   @property
+  def _refines(self) -> bool:
+    return any(each["refine"] for each in self._threads)
+
+  @property
   def aims(self) -> bool:
     """See `Force`."""
     return bool(self)
@@ -274,6 +282,7 @@ class Needles(Force):
       nlisted=len(self._shape["geom"]),
       ngeom=host.m.ngeom,
       edge=float(host.organ.mesh.whole.edge_length),
+      edges=np.tile(self._shape["edges"], (host.nworld if self._refines else 1, 1, 1)),
       law=np.zeros((host.nworld, n, len(PIERCE))),
       lifted=host.lifted(),
       state=host.rows("needle", len(NEEDLE)),
@@ -293,18 +302,25 @@ class Needles(Force):
     host = self.host
     ties, first = host.ties(thread["flex"]), host.zeros(dtype=int)
     frame = {"frame": thread["frame"], "origin": thread["origin"]}
-    given = {"pierced": self.fields, "first": first, "span": ties.span}
+    given = {"pierced": self.fields, "first": first, "span": ties.span, "drawn": thread["edges"]}
+    refines = thread["refine"]
+    given["moved"] = ties.track(len(thread["node"])) if refines else np.zeros((1, 0))
     held = host.fill(Held, given | frame | ties.arrays)
     host.load(_aim)
-    aim, lift, self._feel[k] = (
-      host.command(each, held, self.count, k) for each in (_aim, _lift, _feel)
+    measure, aim, lift, self._feel[k] = (
+      host.command(each, held, self.count, k) for each in (_measure, _aim, _lift, _feel)
     )
+
+    def aim_all():
+      if refines:
+        measure()
+      aim()
 
     def lift_all():
       lift()
       host.open_contacts()
 
-    ties.aims[host.instance, k] = aim, lift_all
+    ties.aims[host.instance, k] = aim_all, lift_all
 
   @property
   def sews(self) -> bool:
@@ -345,7 +361,8 @@ class Needles(Force):
       raise ValueError(
         f"{what} has a thread that crosses the surface {len(rows)} times, expected 1 to {HOLES}"
       )
-    length = self._threads[k]["edges"][:-1, 0]
+    first, count = self._shape["strand"][k]
+    length = self.fields.edges.numpy()[0, first : first + count - 1, 0]
     before = np.r_[0.0, np.cumsum(length)]
     along = np.interp([row[0] for row in rows], np.arange(len(before)), before)
     state = self.fields.state.numpy()[0, k]

@@ -121,6 +121,14 @@ class Config:
     'with `elements="rod"` alone',
     "N s/m²",
   )
+  refine: float = _row(
+    0.0,
+    reading.NOT_NEGATIVE,
+    "length of a rod's edges where it touches itself: nodes move along it to there "
+    "([threads](physics.md#refinement)); 0: edges keep their lengths; with "
+    '`elements="rod"` alone',
+    "m",
+  )
   foundation: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
@@ -296,7 +304,9 @@ KEYS = tuple(ROWS)
 RUNNING = tuple(key for key, row in ROWS.items() if row.change)
 MATERIAL = tuple(key for key, row in ROWS.items() if row.change == TISSUE)
 # All that a rod may have:
-ROD = ("elements", "young", "poisson", "bend", "twist", "strength", "drag", "iterations")
+ROD = (
+  *("elements", "young", "poisson", "bend", "twist", "strength", "drag", "refine", "iterations"),
+)
 RECORDED = tuple(key for key, row in ROWS.items() if row.change == GRAPH)
 
 
@@ -420,7 +430,7 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
         raise ValueError(
           f"organ {organ!r}: {key} is set and elements is 'rod', expected {', '.join(ROD)}"
         )
-  elif only_rods := {"twist", "strength", "drag"} & set(given):
+  elif only_rods := {"twist", "strength", "drag", "refine"} & set(given):
     key = min(only_rods)
     raise ValueError(f"organ {organ!r}: {key} is set, allowed only with elements='rod'")
   spring = config.elements == "spring"

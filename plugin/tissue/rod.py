@@ -4,6 +4,8 @@ import numpy as np
 
 from .config import Config
 
+LONGEST = 2.0  # of the mean edge, what edges become where nodes move along a thread
+
 
 def check_edges(name: str, length: np.ndarray, radius: float):
   """Raises ValueError where an edge is shorter than the radius."""
@@ -12,6 +14,26 @@ def check_edges(name: str, length: np.ndarray, radius: float):
     raise ValueError(
       f"thread {name!r}: edge {k} is {1e3 * length[k]:.3g} mm long and radius is "
       f"{1e3 * radius:.3g} mm, expected edges no shorter than the radius"
+    )
+
+
+def check_refine(name: str, config: Config, length: np.ndarray, radius: float, clamped):
+  """Raises ValueError where nodes are to move along a thread, and cannot."""
+  refine, mean = config.refine, length.mean()
+  if not refine:
+    return
+  what = f"thread {name!r}: refine is {1e3 * refine:.3g} mm and"
+  if not radius <= refine < mean:
+    raise ValueError(
+      f"{what} its edges are {1e3 * mean:.3g} mm long, expected shorter ones, and no shorter than "
+      f"the radius, {1e3 * radius:.3g} mm"
+    )
+  if len(config.young) > 1:
+    raise ValueError(f"{what} young has {len(config.young)} values, expected one")
+  if any(clamped):
+    raise ValueError(
+      f"{what} edge {int(np.argmax(clamped))} is between two pinned nodes, expected none next to "
+      "each other"
     )
 
 
@@ -76,7 +98,7 @@ def energy(constants: dict, x: np.ndarray, twist: np.ndarray, broken: np.ndarray
 
 
 def constants(
-  rest: np.ndarray, radius: float, config: Config, mass: np.ndarray, clamped: np.ndarray
+  length: np.ndarray, radius: float, config: Config, mass: np.ndarray, clamped: np.ndarray
 ) -> dict:
   """Returns the constants of a rod of round section.
 
@@ -84,17 +106,16 @@ def constants(
   of their own, since the fibres of a braid slide on each other.
 
   Args:
-    rest: nodes, straight or not: only the lengths of edges count [m]  (nnode, 3)
+    length: of each edge at rest [m]  (nnode - 1,)
     radius: of the section [m]
     config: its configuration
-    mass: of each node [kg]                                            (nnode,)
-    clamped: whether an edge is rigid                                  (nnode - 1,) bool
+    mass: of each node [kg]           (nnode,)
+    clamped: whether an edge is rigid (nnode - 1,) bool
 
   Returns:
     fields of the native struct by name
   """
-  n = len(rest)
-  length = np.linalg.norm(np.diff(rest, axis=0), axis=1)
+  n = len(length) + 1
   young = np.broadcast_to(np.asarray(config.young, float), (n - 1,))
   area, second = np.pi * radius**2, np.pi * radius**4 / 4
   half = np.where(clamped, 0.0, 0.5 * length)
@@ -102,16 +123,22 @@ def constants(
   at[at == 0.0] = np.inf  # between rigid edges
   node_young = 0.5 * (young[1:] + young[:-1])
   shear = node_young / (2 * (1 + config.poisson))
-  bend, torsion = np.zeros(n), np.zeros(n)
+  bend, torsion, along = np.zeros(n), np.zeros(n), np.append(0.0, np.cumsum(length))
   bend[1:-1] = config.bend * node_young * second / at
   torsion[1:-1] = config.twist * shear * 2 * second / at
   return {
     "nnode": n,
     "twists": int(config.twist > 0 and clamped.sum() > 1),  # else nothing holds a twist
     "shortest": float(length.min()),
-    "longest": float(length.max()),
+    "longest": max(float(length.max()), bool(config.refine) * LONGEST * float(length.mean())),
     "length": np.append(length, 0.0),
-    "along": np.append(0.0, np.cumsum(length)),
+    "along": along,
+    "drawn": along,
+    "refine": config.refine,
+    "mean": float(along[-1] / n),
+    "axial": float(young[0] * area),
+    "flexural": float(config.bend * young[0] * second),
+    "viscous": config.drag,
     "stretch": np.append(young * area / length, 0.0),
     "drag": config.drag * 0.5 * (np.append(length, 0.0) + np.append(0.0, length)),
     "bend": bend,

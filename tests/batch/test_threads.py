@@ -2,10 +2,12 @@
 
 import mujoco
 import numpy as np
+import palpate
 import palpate.batch
 import pytest
 from devices import needs_cuda
 from scenes import rods as one
+from scenes import threads
 
 DEVICES = ["warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
 
@@ -243,6 +245,33 @@ def test_a_world_goes_on_where_a_state_says(device):
   one.run(model, fresh, 50)
   expected = palpate.Thread(model, fresh, "t").positions
   assert np.abs(worlds.thread("t").xpos.numpy()[0] - expected).max() < 1e-5
+
+
+@pytest.mark.parametrize("device", ["cpu", *DEVICES])
+def test_nodes_move_along_a_thread_as_in_one_world(device):
+  """From a state in which a knot tightens; tension by the edges' present lengths, and a reset."""
+  points = threads.overhand(0.0012, 8 * threads.RADIUS, 0.008)
+  spec = mujoco.MjSpec()
+  spec.option.gravity = (0, 0, 0)
+  palpate.add_thread(spec, points, "t", refine=2.5 * threads.RADIUS)
+  way = points[-1] - points[0]
+  threads.add_hands(spec, "t", points, ((0, -way), (len(points) - 1, way)), 2.0)
+  model, data, thread, worlds = scene(spec, device)
+  run(model, data, worlds, 60, lambda k: min(0.3, 0.01 * k))
+  worlds.set_state(1, data)
+  before = thread.rest_lengths
+  run(model, data, worlds, 10, lambda k: 0.3)
+  assert np.abs(thread.rest_lengths - before).max() > 1e-5
+  assert np.abs(worlds.thread("t").xpos.numpy()[1] - thread.positions).max() < 1e-6
+  np.testing.assert_allclose(worlds.thread("t").tension.numpy()[1], thread.tension, atol=1e-3)
+  other = mujoco.MjData(model)
+  worlds.get_state(1, other)
+  found = palpate.Thread(model, other, "t").rest_lengths
+  np.testing.assert_allclose(found, thread.rest_lengths, atol=1e-7)
+  worlds.reset()
+  worlds.get_state(1, other)
+  lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+  np.testing.assert_allclose(palpate.Thread(model, other, "t").rest_lengths, lengths, rtol=1e-12)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -34,6 +34,18 @@ def overhand(size, segment, tail):
   return resampled(with_tails(curve, tail), segment)
 
 
+def graded(curve, fine, coarse, half, growth=1.15):
+  """Returns points along a curve, `fine` apart within `half` of its middle, then up to `coarse`."""
+  along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
+  middle, at, edge = 0.5 * along[-1], [0.0], fine
+  while at[-1] < middle:
+    edge = min(coarse, edge * growth) if at[-1] > half else edge
+    at.append(at[-1] + edge)
+  at = np.array(at) * middle / at[-1]
+  at = middle + np.r_[-at[:0:-1], at]
+  return np.stack([np.interp(at, along, c) for c in curve.T], axis=1)
+
+
 def tangle(seed, segment):
   """A random smooth curve, no nearer to itself than it is thick, between straight ends."""
   rng = np.random.RandomState(seed)
@@ -137,8 +149,10 @@ def add_hands(spec, thread, points, hands, damping):
     )
 
 
-def by_hands(points, force, steps, step=mujoco.mj_step, **config):
+def by_hands(points, force, steps, step=mujoco.mj_step, within=50, **config):
   """Returns a thread whose ends hands have pulled apart, and how it went.
+
+  Their force grows `within` so many steps.
 
   Returns:
     the thread; whether none of it came before a hand, where an open thread is closed for its knot:
@@ -148,7 +162,7 @@ def by_hands(points, force, steps, step=mujoco.mj_step, **config):
   model, data, thread = load(points, ((0, -axis), (len(points) - 1, axis)), **config)
   places, clear, through = thread.positions, True, 0
   for k in range(steps):
-    data.ctrl[:] = force * min(1.0, k / 50)
+    data.ctrl[:] = force * min(1.0, k / within)
     step(model, data)
     before, places = places, thread.positions
     through += passes(before, places)
@@ -205,13 +219,22 @@ def throws(turns, radius, segment, ear=5e-3, arm=5e-3):
   return points, *(int(np.linalg.norm(points - at, axis=1).argmin()) for at in bow[[0, -1]])
 
 
-def stitch(nodes, window=0, segment=4.5e-4):
+def masses(thread):
+  """Returns the mass of each node of a thread with `refine` [kg], which goes by its length."""
+  half = 0.5 * thread.rest_lengths
+  return thread.model.body("t_0").mass[0] * (np.append(half, 0) + np.append(0, half)) * (
+    len(half) + 1
+  ) / (2 * half.sum())
+
+
+def stitch(nodes, window=0, segment=4.5e-4, **thread):
   """Returns a stitch through a slit drain with a square knot on top, its ends in hands.
 
   Args:
     nodes: of the drain, about
     window: its nodes that instruments can touch at once, 0 for all
     segment: length of the thread's edges [m]
+    **thread: see `palpate.add_thread`
 
   Returns:
     model, data and the thread, of some hundred nodes
@@ -221,7 +244,7 @@ def stitch(nodes, window=0, segment=4.5e-4):
   side = np.sign(knot[first, 0]) * np.array([0.5 * drain.BITE, 0, 0])
   chord = np.linspace(drain.MIDDLE + side, drain.MIDDLE - side, 20)
   points = resampled(np.concatenate([knot[:first] + up, chord, knot[last + 1 :] + up]), segment)
-  spec = drain.build(Scene(instrument="knot_pusher", nodes=nodes), points)
+  spec = drain.build(Scene(instrument="knot_pusher", nodes=nodes), points, **thread)
   if window:
     palpate.add_windows(spec, ORGAN, nodes=window)
   ends = [(k, np.sign(points[k, 0]) * np.array([1, 0, 0])) for k in (0, len(points) - 1)]

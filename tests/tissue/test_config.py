@@ -34,6 +34,7 @@ REFUSED = [
   ("twist", "-1", "a number >= 0"),
   ("strength", "-1", "a number >= 0"),
   ("drag", "-1", "a number >= 0"),
+  ("refine", "-1", "a number >= 0"),
   ("pressure", "inf", "a finite number"),
   ("damping", "-0.002", "a number >= 0"),
   ("integrator", "euler", "'implicit'"),

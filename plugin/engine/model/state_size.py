@@ -11,7 +11,8 @@ def state_size(model: int, instance: int) -> int:
   """Returns the length of the plugin state: at least what `coupling.sizes` will ask for."""
   m = mjstruct.Model.from_address(model)
   if declare.is_rod(model, instance):
-    return layout.size(RodState, {"nvert": m.nflexvert, "nv": m.nv})
+    refine = mjstruct.config(model, instance, "refine").strip() not in ("", "0")
+    return layout.size(RodState, layout.rod_sizes(m.nflexvert, m.nv, refine))
   relaxes, rests, bonded = (
     bool(mjstruct.config(model, instance, key).strip())
     for key in ("relax_share", "support", "bonds")

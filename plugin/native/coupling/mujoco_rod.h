@@ -60,11 +60,11 @@ struct MujocoRod {
     const D3 Mhat = inertia(i), a = load(f.qacc.data + adr);
     return D3{Mhat.x * a.x, Mhat.y * a.y, Mhat.z * a.z} - load(f.qfrc_smooth.data + adr);
   }
-  PALPATE void move(int i, D3 moved, double h) const {
+  PALPATE void move(int i, D3 moved, D3 velocity) const {
     const int q = f.qposadr.data[i];
     const D3 at = load(rod.start.data + 3 * i) - load(f.rest.data + 3 * i) + load(f.mj.qpos0.data + q);
     store(f.mj.qpos.data + q, at + moved);
-    store(f.mj.qvel.data + f.dofadr.data[i], (1.0 / h) * moved);
+    store(f.mj.qvel.data + f.dofadr.data[i], velocity);
   }
 
   PALPATE bool is_own(const char* contact) const {
@@ -125,12 +125,12 @@ struct MujocoRod {
       rod.turn.data[i] = 0.0;
       D3 x = load(f.rest.data + 3 * i), v = zero, force = zero;
       if (adr >= 0) {
-        const double m = rod.mass.data[i] = mj.body_mass.data[body];
+        const double weighs = mj.body_mass.data[body], m = rod.mass.data[i] = mass_of(rod, i, weighs);
         x += load(mj.qpos.data + q) - load(mj.qpos0.data + q);
         v = load(mj.qvel.data + adr);
-        const D3 along = m * gravity + load(mj.qfrc_applied.data + adr) + load(mj.qfrc_passive.data + adr);
+        const D3 along = weighs * gravity + load(mj.qfrc_applied.data + adr) + load(mj.qfrc_passive.data + adr);
         force = external(along, R, mj.xfrc_applied.data + 6 * body);
-        store(rod.aim.data + 3 * i, x + h * v + (h * h / m) * force);
+        store(rod.aim.data + 3 * i, x + h * v + (h * h / m) * (force + (m - weighs) * gravity));
       } else {
         store(rod.aim.data + 3 * i, x);
       }

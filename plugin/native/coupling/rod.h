@@ -18,7 +18,7 @@
 // (`mujoco_rod.h`).
 #pragma once
 #include "coupling/node.h"
-#include "solver/rod_step.h"
+#include "solver/rod_refine.h"
 
 AS_WRITTEN
 
@@ -442,6 +442,7 @@ PALPATE bool is_free(const Rod& rod) {
 template <class Host>
 PALPATE void begin(const Host& host, double h) {
   const auto& rod = host.rod;
+  if (rod.refine > 0.0) measure(rod);
   host.gather(h);
   each_lane(0, host.f.nv, [&](int d) {
     rod.known.data[d] = host.known(d);
@@ -566,9 +567,11 @@ PALPATE void end(const Host& host, double h) {
   each_lane(1, inner, [&](int i) { rod.trial.data[i] = twist_at(rod, rod.place.data, rod.turn.data, i); });
   each_lane(1, inner, [&](int i) { rod.own.twist.data[i] = is_joint(rod, i) ? rod.trial.data[i] : 0.0; });
   break_edge(rod);
+  each_lane(0, 3 * rod.nnode, [&](int a) { rod.vel.data[a] = (1.0 / h) * (rod.place.data[a] - rod.start.data[a]); });
+  if (rod.refine > 0.0 && rod.status.data[0] >= 0) refine(rod);
   each_lane(0, rod.nnode, [&](int i) {
     if (!host.moves(i)) return;
-    host.move(i, load(rod.place.data + 3 * i) - load(rod.start.data + 3 * i), h);
+    host.move(i, load(rod.place.data + 3 * i) - load(rod.start.data + 3 * i), load(rod.vel.data + 3 * i));
   });
 }
 

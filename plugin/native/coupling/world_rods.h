@@ -66,12 +66,12 @@ struct WorldRod {
 
   // Where qpos has a place, from rest.
   PALPATE D3 zero(int i) const { return load(f.qpos0.data + f.qposadr.data[i]) - load(f.rest.data + 3 * i); }
-  PALPATE void move(int i, D3 moved, double h) const {
-    const D3 x = load(rod.start.data + 3 * i) + moved, v = (1.0 / h) * moved;
+  PALPATE void move(int i, D3 moved, D3 velocity) const {
+    const D3 x = load(rod.start.data + 3 * i) + moved;
     store(f.now.data + 3 * i, x);
-    store(f.speed.data + 3 * i, v);
+    store(f.speed.data + 3 * i, velocity);
     store(f.qpos.data + f.qposadr.data[i], x + zero(i));
-    store(f.qvel.data + f.dofadr.data[i], v);
+    store(f.qvel.data + f.dofadr.data[i], velocity);
   }
   // What floats have, by the doubles that they are of.
   PALPATE static D3 exact(const float* told, D3 exact) {
@@ -118,12 +118,12 @@ struct WorldRod {
       rod.turn.data[i] = 0.0;
       D3 x = load(f.rest.data + 3 * i), v = none, force = none, aim = x;
       if (adr >= 0) {
-        const double m = rod.mass.data[i];
+        const double m = rod.mass.data[i], weighs = rod.body.data[i];
         x = exact(f.qpos.data + f.qposadr.data[i], load(f.now.data + 3 * i) + zero(i)) - zero(i);
         v = exact(f.qvel.data + adr, load(f.speed.data + 3 * i));
-        const D3 along = m * gravity + load(f.qfrc_applied.data + adr) + load(f.qfrc_passive.data + adr);
+        const D3 along = weighs * gravity + load(f.qfrc_applied.data + adr) + load(f.qfrc_passive.data + adr);
         force = add_turned(along, R, load((const float*)f.xfrc_applied.data + 6 * f.bodyid.data[i]));
-        aim = x + h * v + (h * h / m) * force;
+        aim = x + h * v + (h * h / m) * (force + (m - weighs) * gravity);
       }
       store(rod.start.data + 3 * i, x);
       store(rod.vel.data + 3 * i, v);

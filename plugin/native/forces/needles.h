@@ -59,6 +59,7 @@ PALPATE Fields of_world(Fields f, int world) {
   move_to(f.mj.M, world);
   move_to(f.elem, f.mesh.data[world]), move_to(f.tet, f.mesh.data[world]);
   move_to(f.flat, f.mesh.data[world]);
+  move_to(f.edges, f.edges.shape[0] > 1 ? world : 0);
   return f;
 }
 
@@ -66,7 +67,7 @@ PALPATE Fields of_world(Fields f, int world) {
 template <class Fields>
 PALPATE Fields held_in_world(Fields f, int world) {
   f.pierced = of_world(f.pierced, world);
-  move_each(world, f.first, f.tie_count, f.tie_edge, f.tie_value, f.span);
+  move_each(world, f.first, f.tie_count, f.tie_edge, f.tie_value, f.span, f.moved);
   return f;
 }
 
@@ -668,6 +669,19 @@ PALPATE void lift_thread(const Fields& given, Thread t, int i) {
   double part;
   edges[0] = near > 0.0 ? thread.find(near, part) : 0;
   edges[1] = thread.find(all.span.data[1] + margin, part) + 1;
+}
+
+// Takes the lengths of the edges of a thread whose nodes move along it.
+template <class Fields>
+PALPATE void measure_thread(const Fields& given, Thread t, int i) {
+  const Fields all = held_in_world(given, t.world);
+  const auto thread = strand_of(all.pierced, i);
+  each_item(t, thread.count - 1, [&](int e) {
+    double* edge = all.pierced.edges.data + 2 * (thread.first + e);
+    const double* drawn = all.drawn.data + 2 * e;
+    edge[0] = drawn[0] + (all.moved.data[e + 1] - all.moved.data[e]);
+    edge[1] = drawn[1] * (drawn[0] / edge[0]);
+  });
 }
 
 // Says what holds a needle's thread, as the step begins: the points of the tissue where they will be.

@@ -7,6 +7,8 @@
 - Knots are drawn tight by 2 N at all four strands, the ends are let go, and the strands are pulled
   apart by up to 80 % of the thread's strength.
 - An overhand knot is drawn tight by 0.5 N with edges of 2 to 5 radii.
+- The same in 15 cm of thread within 0.5 s, with edges that are alike, that are graded (short in the
+  middle), or that begin alike and are refined where the thread touches itself (`refine`).
 - The square knot of a stitch through a drain of 1000 nodes is drawn tight by 1 N, and timed while
   it is held so.
 
@@ -33,6 +35,15 @@ KNOTS = ((1,), (1, 1), (1, -1), (2, -1), (2, -1, 1))
 MATERIALS = ("silk", "vicryl", "polypropylene")
 FRICTIONS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4)  # of silk on itself
 SEGMENTS = (2.0, 2.5, 3.0, 4.0, 5.0)  # [radii]
+# Of 15 cm, by name: the edges at the ends, and if they are others those in the middle [radii].
+FINE, TAIL = 2.2, 0.057  # [m]
+LONG = {
+  "alike 2.2": (FINE, 0.0),
+  "alike 4.8": (4.8, 0.0),
+  "alike 10.9": (10.9, 0.0),
+  "graded": (18.0, FINE),
+  "refined": (10.9, FINE),
+}
 # Nodes of an organ in a window, which MuJoCo has; 0 for all.
 STITCHES = {"stitch": 0, "stitch windowed": 24}
 _START = 20  # steps
@@ -64,6 +75,10 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   edges = [
     {"case": f"edges {segment:g}", "kind": "edge", "segment": segment}
     for segment in SEGMENTS[-1 if short else 0 :]
+  ]
+  edges += [
+    {"case": f"15 cm {name}", "kind": "long", "how": name}
+    for name in list(LONG)[-1 if short else 0 :]
   ]
   stitches = [
     {"case": case, "kind": "stitch", "window": window}
@@ -129,6 +144,25 @@ def edge(segment: float) -> Row:
   }  # fmt: skip
 
 
+def long(how: str) -> Row:
+  """Does so with a long thread, see LONG."""
+  (coarse, fine), radius, config = LONG[how], scene.RADIUS, {}
+  points = scene.overhand(0.0012, (coarse if how != "graded" else 0.1) * radius, TAIL)
+  if how == "graded":
+    points = scene.graded(points, fine * radius, coarse * radius, 0.004)
+  elif fine:
+    config["refine"] = fine * radius
+  took: list[float] = []
+  thread, *_ = scene.by_hands(
+    points, 0.5, 1000, lambda m, d: took.append(_timed(m, d)), within=500, **config
+  )
+  kept = thread.length - np.linalg.norm(thread.positions[-1] - thread.positions[0])
+  return {
+    "kind": "long", "knot": how, "segment": coarse, "nodes": len(points), "kept_mm": 1e3 * kept,
+    "error": thread.error or "", **_times(took),
+  }  # fmt: skip
+
+
 def stitch(window: int) -> Row:
   """Draws the knot of a stitch tight and returns what steps take from then on."""
   model, data, thread = scene.stitch(1000, window)
@@ -150,6 +184,8 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     return [tangle(seed) for seed in range(case["seed"], case["seed"] + case["count"])]
   if case["kind"] == "edge":
     return [edge(case["segment"])]
+  if case["kind"] == "long":
+    return [long(str(case["how"]))]
   if case["kind"] == "stitch":
     return [stitch(int(case["window"]))]
   turns = tuple(map(int, str(case["turns"]).split()))
@@ -184,23 +220,27 @@ def finding(rows: list[Row]) -> list[str]:
 
 def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
-  kinds = "tangle", "pull", "edge", "stitch"
+  kinds = "tangle", "pull", "edge", "long", "stitch"
   by = {kind: [r for r in rows if r["kind"] == kind] for kind in kinds}
   pulls = [
     [r["knot"], r["material"], f"{r['friction'] or '-'}", f"{r['held']:.2f}", f"{r['slip_mm']:.1f}",
      f"{r['median_ms']:.2f}", f"{r['high_ms']:.1f}"]
     for r in by["pull"]
   ]  # fmt: skip
-  edges = [
-    [f"{r['segment']:g}", str(r["nodes"]), f"{r['kept_mm']:.2f}", f"{r['median_ms']:.2f}",
-     f"{r['high_ms']:.1f}"]
-    for r in by["edge"]
-  ]  # fmt: skip
+  edges, lengths = (
+    [
+      [f"{r['segment']:g}" if r["kind"] == "edge" else r["knot"], str(r["nodes"]),
+       f"{r['kept_mm']:.2f}", f"{r['median_ms']:.2f}", f"{r['high_ms']:.1f}"]
+      for r in by[kind]
+    ]
+    for kind in ("edge", "long")
+  )  # fmt: skip
   times = ["median [ms]", "99 % [ms]"]
   head = ["knot", "material", "friction, if not its own", "held", "came out [mm]", *times]
   lines = [str(__doc__).partition("\n\n")[2], "", *plots.table(head, pulls), ""]
   head = ["edge [radii]", "nodes", "kept in the knot [mm]", *times]
   lines += [*plots.table(head, edges), ""]
+  lines += [*plots.table(["edges in 15 cm [radii]", *head[1:]], lengths), ""]
   stitches = [
     [r["case"], str(r["nodes"]), r["knot"], f"{r['median_ms']:.2f}", f"{r['high_ms']:.2f}"]
     for r in by["stitch"]
