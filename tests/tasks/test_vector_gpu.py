@@ -63,7 +63,7 @@ class Beside:
 
 
 TASKS = "grasp/easy", "retract/easy", "dissect/easy", "tease/easy", "bimanual/easy", "cut/easy"
-TASKS += ("suture/drive_easy", "suture/running_easy")
+TASKS += ("suture/drive_easy", "suture/running_easy", "suture/knot_easy")
 
 
 @pytest.mark.parametrize(

@@ -195,14 +195,13 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
 def finding(rows: list[Row]) -> list[str]:
   """Returns what the page begins with."""
   tangles = [r for r in rows if r["kind"] == "tangle"]
-  free = sum(not r["passes"] for r in tangles)
-  told = [r for r in tangles if r["same"] in (0, 1)]
-  same = sum(r["same"] for r in told)
+  decided = [r for r in tangles if not r["passes"] or r["same"] in (0, 1)]
+  kept = sum(r["same"] != 0 for r in decided)
   held = [f"{r['knot']} {r['held']:.0%}" for r in rows if r["kind"] == "pull"
           and r["material"] == "silk" and not r["friction"]]  # fmt: skip
   lines = [
-    f"In {free} of {len(tangles)} tangles pulled tight no edge passes another. "
-    f"{same} of the {len(told)} whose knot can be told keep it."
+    f"Of {len(tangles)} tangles pulled tight {len(decided)} are decided, and {kept} of these keep "
+    "their knot."
   ]
   if held:
     lines.append(
@@ -250,11 +249,12 @@ def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   unsolved = sum("not solved" in r["error"] for r in by["tangle"])
   other = sum(bool(r["error"]) for r in by["tangle"]) - unsolved
   lost = [str(r["seed"]) for r in by["tangle"] if r["same"] == 0]
-  open_ = [str(r["seed"]) for r in by["tangle"] if r["passes"] and r["same"] not in (0, 1)]
+  free = sum(not r["passes"] for r in by["tangle"])
+  undecided = [str(r["seed"]) for r in by["tangle"] if r["passes"] and r["same"] not in (0, 1)]
   lines += [
-    f"Steps that were not solved to the end are in {unsolved} tangles, other errors in {other}. "
-    f"Changed knots: {', '.join(lost) or 'none'}. Neither without a passage nor told: "
-    f"{', '.join(open_) or 'none'}.",
+    f"In {free} tangles no edge passes another. Undecided: {', '.join(undecided) or 'none'}. "
+    f"Changed knots: {', '.join(lost) or 'none'}. "
+    f"Steps that were not solved to the end are in {unsolved} tangles, other errors in {other}.",
     "",
     results.link(path),
   ]
