@@ -481,6 +481,14 @@ class Tissue(Parting):
     return self._read("iterations")
 
   @property
+  def applied(self) -> wp.array:
+    """Force applied to each vertex, (nworld, nvert, 3) [N]; write into it.
+
+    It is zero at first and in worlds that were reset, and is not in their state.
+    """
+    raise ValueError("worlds on several devices have what is applied in `parts`")
+
+  @property
   def contacts(self) -> Contacts:
     """Contacts of the last step; on a GPU alone, on the CPU they are in `Batch.datas`."""
     raise ValueError(f"organ {self.name!r}: contacts are in `batch.datas` on the CPU")

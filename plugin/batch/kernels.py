@@ -173,6 +173,21 @@ def spread_nodes(p: Patch, adr: wp.array[int], velocity: int, out: wp.array2d[fl
         out[w, adr[i] + c] = p.solve.disp[w, n // 8, c, n % 8] + shift
 
 
+@wp.kernel(enable_backward=False)
+def apply(p: Patch, applied: wp.array3d[float]):
+  """Adds the force that is applied to each vertex to the solver's input."""
+  w, i = wp.tid()
+  force = wp.vec3(applied[w, i, 0], applied[w, i, 1], applied[w, i, 2])
+  if wp.length_sq(force) > 0.0:
+    n = p.node[i]
+    p.calm[w] = wp.float64(0.0)
+    for c in range(3):
+      own = float(0.0)  # in the organ's frame
+      for r in range(3):
+        own += float(p.frame[r, c]) * force[r]
+      p.solve.force_ext[w, n // 8, c, n % 8] = p.solve.force_ext[w, n // 8, c, n % 8] + own
+
+
 @struct
 class Whole:
   """What worlds have again that are whole again."""

@@ -85,6 +85,8 @@ class Threads(Batch):
     def work(world: int):
       model, data = self.models[world], self.datas[world]
       data.ctrl[:] = ctrl[world]
+      for organ in self._organs.values():
+        organ.push(world)
       if not len(first):
         mujoco.mj_step(model, data, n)
         return self._look(world)
@@ -127,6 +129,9 @@ class Threads(Batch):
       data.time, data.ctrl[:] = 0.0, 0.0
     engine.place_windows(model, data)
     self.ctrl.numpy()[world] = 0.0
+    for organ in self._organs.values():
+      if organ.forced:
+        organ.applied.numpy()[world] = 0.0
 
   def _reset(self, mask: wp.array):
     self.each(self._reset_world, np.flatnonzero(mask.numpy()))
@@ -223,6 +228,25 @@ class _Tissue(Tissue):
       name: wp.zeros(self.batch.nworld, dtype=float, device="cpu")
       for name in ("residual", "iterations")
     }
+
+  @functools.cached_property
+  def applied(self) -> wp.array:
+    if self.space.organ.windows:
+      raise ValueError(f"organ {self.name!r}: it has windows, on whose nodes no force is applied")
+    return wp.zeros((self.batch.nworld, self.nvert, 3), dtype=float, device="cpu")
+
+  @property
+  def forced(self) -> bool:
+    """Whether somebody applies forces to it."""
+    return "applied" in self.__dict__
+
+  def push(self, world: int):
+    """Applies the forces of a world."""
+    if self.forced:
+      model, flex = self.batch.models[world], self.space.organ.flex
+      first = model.flex_vertadr[flex]
+      body = model.flex_vertbodyid[first : first + self.nvert]
+      self.batch.datas[world].xfrc_applied[body, :3] = self.applied.numpy()[world]
 
   @functools.cached_property
   def bonds(self) -> OfThreads:

@@ -58,6 +58,7 @@ class Common:
   sensor_mean: floats("nworld", "nsensordata")
   failures: ints("nworld")
   xpos: floats("nworld", "nvert", 3)
+  applied: floats("nworld", "napplied", 3)  # force on each vertex, see `rules.apply` [N]
   # Of jaws, and of points that the organ may hide.
   side: floats("nside")  # of a geom, see `Jaws`
   inner: floats("nworld", 2)  # force of the jaws' inner faces [N]

@@ -1,9 +1,12 @@
-"""The throw of a thread in each of many worlds, see `rules.throw`.
+"""The throws of a thread in each of many worlds, see `rules.tied`.
 
 A knot is told by its Alexander polynomial D, up to a sign and a power of t: the determinant of a
 minor of the relations of its arcs at their crossings in a picture (Alexander 1928,
 doi:10.1090/S0002-9947-1928-1501429-1). |D(-1)| and |D(2)| up to a power of 2 are 1 and 1 without a
-knot, 3 and 3 of an overhand knot and 5 and 11 of a double throw.
+knot, 3 and 3 of an overhand knot and 5 and 11 of a double throw; of throws one after the other they
+are the products. Whichever way round a throw is they are the same, but not the sum of the signs of
+crossings: 3 and 5 of throws one way round, -3 and -5 of others, in any reduced alternating picture
+(Thistlethwaite 1988, doi:10.1016/0040-9383(88)90012-2), as one of few crossings nearly is.
 """
 
 # Vectors of Warp's are not known to type checkers:
@@ -16,6 +19,9 @@ from .fields import VIEWS, Common
 
 MOST = 40  # crossings of a picture that is looked at
 _MOST, _NEAR = wp.constant(MOST), wp.constant(wp.float64(1e-3))
+# |D(-1)| and |D(2)| of a single and of a double throw, and how far sums of signs may be off.
+_SINGLE, _DOUBLE = wp.constant(wp.vec2d(3.0, 3.0)), wp.constant(wp.vec2d(5.0, 11.0))
+_APART = wp.constant(3.0)
 _MORE = wp.constant(3)  # corners that close the thread, see `metrics.knots.closed`
 
 
@@ -146,8 +152,48 @@ def _determinant(s: Common, w: int, count: int, t: wp.float64):
 
 
 @wp.func
-def throw(s: Common, w: int):
-  """Returns how often the thread is wound about itself in its one throw, see `rules.throw`."""
+def _writhe(s: Common, w: int, count: int):
+  """Returns the sum of the signs of the noted crossings without those that untwist.
+
+  Such a crossing parts the thread: all others have both or none of their strands between its own.
+  """
+  sum = float(0.0)
+  for k in range(count):
+    low = wp.min(s.crossing[w, k, 0], s.crossing[w, k, 1])
+    high = wp.max(s.crossing[w, k, 0], s.crossing[w, k, 1])
+    parts = bool(True)
+    for j in range(count):
+      one, other = s.crossing[w, j, 0], s.crossing[w, j, 1]
+      if j != k and (one > low and one < high) != (other > low and other < high):
+        parts = False
+    if not parts:
+      sum += wp.sign(s.crossing[w, k, 2])
+  return sum
+
+
+@wp.func
+def _halves(turns: wp.array[int], count: int):
+  """Returns by how many half turns the strands of so many throws wind, back and forth."""
+  sum = float(0.0)
+  for k in range(count):
+    half = float(2 * turns[k] + 1)
+    sum += wp.where(k % 2 == 0, half, -half)
+  return wp.abs(sum)
+
+
+@wp.func
+def _divide(value: wp.float64, by: wp.float64):
+  """Returns how often a whole number can be divided by another one."""
+  found, rest = int(0), wp.float64(value)
+  while rest > wp.float64(1.5) and wp.abs(rest / by - wp.round(rest / by)) < _NEAR:
+    rest = rest / by
+    found += 1
+  return found
+
+
+@wp.func
+def tied(s: Common, w: int, turns: wp.array[int]):
+  """Returns how many throws of a knot the thread has, see `rules.tied`."""
   middle, size = _box(s, w)
   best = int(0)
   least = int(1 << 20)
@@ -163,13 +209,25 @@ def throw(s: Common, w: int):
   count = _cross(s, w, s.views[best], middle, size, True)
   first = _determinant(s, w, count, wp.float64(-1.0))
   second = _determinant(s, w, count, wp.float64(2.0))
-  while second >= wp.float64(2.0):
+  one, two = _divide(first, _SINGLE[0]), _divide(first, _DOUBLE[0])
+  for _k in range(one):
+    first = first / _SINGLE[0]
+    second = second / _SINGLE[1]
+  for _k in range(two):
+    first = first / _DOUBLE[0]
+    second = second / _DOUBLE[1]
+  while second >= wp.float64(2.0) - _NEAR:
     second = second / wp.float64(2.0)
-  found = int(-1)
-  if wp.abs(first - wp.float64(1.0)) < _NEAR and wp.abs(second - wp.float64(1.0)) < _NEAR:
-    found = 0
-  if wp.abs(first - wp.float64(3.0)) < _NEAR and wp.abs(second - wp.float64(1.5)) < _NEAR:
-    found = 1
-  if wp.abs(first - wp.float64(5.0)) < _NEAR and wp.abs(second - wp.float64(1.375)) < _NEAR:
-    found = 2
+  while second > wp.float64(0.0) and second < wp.float64(1.0) - _NEAR:
+    second = second * wp.float64(2.0)
+  known = wp.abs(first - wp.float64(1.0)) < _NEAR and wp.abs(second - wp.float64(1.0)) < _NEAR
+  if not known or one + two > turns.shape[0]:
+    return -1
+  writhe = wp.abs(_writhe(s, w, count))
+  found = int(0)
+  for k in range(turns.shape[0]):
+    one -= wp.where(turns[k] == 1, 1, 0)
+    two -= wp.where(turns[k] == 2, 1, 0)
+    if one == 0 and two == 0 and (k == 0 or wp.abs(writhe - _halves(turns, k + 1)) < _APART):
+      found = k + 1
   return found

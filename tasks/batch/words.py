@@ -205,8 +205,19 @@ def hold(s: Common, hand: int, node: int, place: wp.vec3, firm: bool):
 
 
 @word
-def throw(s: Common):
-  return throws.throw(s, s.world)
+def tied(s: Common, turns: wp.array[int]):
+  return throws.tied(s, s.world, turns)
+
+
+@word
+def apply(s: Common, k: int, force: wp.vec3):
+  for c in range(3):
+    s.applied[s.world, k, c] = force[c]
+
+
+@word
+def settle(s: Common):
+  """See `rules`: they are given between steps."""
 
 
 @word

@@ -121,7 +121,7 @@ class Worlds:
       nv=model.nv, nu=model.nu, nsensordata=model.nsensordata, nstep=self._substeps,
       naction=len(task.components), naxis=len(names), ncontrol=len(names) + 1,
       nside=model.ngeom + 1, nspot=len(getattr(task, "disc", ())), nbond=len(physics.organ.bonds),
-      ncutter=len(physics.organ.cutters), nneedle=len(physics.organ.needles),
+      ncutter=len(physics.organ.cutters), nneedle=len(physics.organ.needles), napplied=0,
       **self._sizes_of_thread(physics if prefix == task.prefix else None),
     )  # fmt: skip
     s = allocate(Common, self.device, sizes)
@@ -150,6 +150,8 @@ class Worlds:
     batch = self.batch
     s.ctrl, s.failures = batch.ctrl, batch.failures
     s.sensor_mean, s.sensor_steps = batch.sensor_mean, self._steps
+    if rules.apply in self.states.words and prefix == task.prefix:
+      s.applied = self.organ.applied
     self._read(s)
     return s
 

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, get_type_hints
 
 import mujoco as mj
@@ -359,13 +359,33 @@ def hold(s: Any, hand: int, node: int, place: np.ndarray, firm: bool) -> None:
   s.thread.hold(f"{prefix}{s.thread.name}", int(node), place + tip, firm)
 
 
-def throw(s: Any) -> int:
-  """Returns how often the thread is wound about itself in its one throw, 0 where it has no knot.
+def tied(s: Any, turns: Sequence[int]) -> int:
+  """Returns how many throws of a knot the thread has, each the other way round than the one before.
 
-  -1 where it has another knot, or is too tangled to tell.
+  0 where it has none, or other throws than these, a granny's too; -1 where it has another knot than
+  of so many throws, or is too tangled to tell.
+
+  Args:
+    s: the world
+    turns: how often the strands wind about each other in each throw of the knot
   """
-  found = knots.throws(knots.closed(s.thread.positions), 1)
-  return -1 if found is None else sum(map(abs, found))
+  found = knots.throws(knots.closed(s.thread.positions), len(turns))
+  if found is None:
+    return -1
+  return next((k for k in range(len(turns) + 1) if knots.same(found, turns[:k])), 0)
+
+
+def apply(s: Any, k: int, force: np.ndarray) -> None:
+  """Applies a force to a vertex of the organ, until another one is [N]; `settle` is to follow."""
+  model = s.model.ptr
+  flex = mj.mj_name2id(model, mj.mjtObj.mjOBJ_FLEX, s.organ.name)
+  body = model.flex_vertbodyid[model.flex_vertadr[flex] + k]
+  s.data.ptr.xfrc_applied[body, :3] = force
+
+
+def settle(s: Any) -> None:
+  """Lets the next step know of these forces: it would throw up what it did not know of."""
+  s.forward()
 
 
 def lens(s: Any) -> np.ndarray:

@@ -7,7 +7,7 @@ or left-handed. Throws one after the other are their connected sum, with the pro
 import collections
 import functools
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -63,6 +63,17 @@ def throws(polygon: np.ndarray, most: int = 3) -> tuple[int, ...] | None:
       if found == functools.reduce(_times, map(_torus, each), {0: 1}):
         return each
   return None
+
+
+def same(found: tuple[int, ...], turns: Sequence[int]) -> bool:
+  """Returns whether throws are those of a knot whose throws alternate, or of its mirror image.
+
+  Args:
+    found: see `throws`
+    turns: of each throw of the knot
+  """
+  wound = [(-1) ** k * each for k, each in enumerate(turns)]
+  return sorted(found) in (sorted(wound), sorted(-each for each in wound))
 
 
 def name(polygon: np.ndarray) -> str:

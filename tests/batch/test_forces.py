@@ -7,7 +7,7 @@ import palpate.batch
 import pytest
 from devices import needs_cuda
 from palpate.batch import strip_organs
-from scenes import ball, box, load, sphere, windowed, workspace, world
+from scenes import ball, box, documents, load, sphere, windowed, workspace, world
 
 BACKENDS = ["cpu", "warp-cpu", pytest.param("cuda:0", marks=needs_cuda)]
 BODIES = """<body name="bed" pos="0 0 -0.0605"><geom name="bed" type="box" size="0.1 0.1 0.01"
@@ -204,3 +204,25 @@ def test_an_organ_rests_on_another(device):
   for organ in (low, high):
     found = batch.organ(organ.name).xpos.numpy()
     np.testing.assert_allclose(found, np.tile(organ.xpos, (2, 1, 1)), atol=2e-6)
+
+
+@pytest.mark.parametrize("device", BACKENDS)
+def test_a_force_that_is_applied_to_a_vertex_moves_it_as_the_plugin_does(device):
+  points, elem = sphere(1)
+  made = world(documents.organ(points, elem, **KEYS | {"foundation": 2e3}), ball(1.0))
+  model, data, single = load(made)
+  batch = palpate.batch.make(mujoco.MjSpec.from_string(made), 2, device=device)
+  tissue, top = batch.organ("organ"), int(points[:, 2].argmax())
+  rest, force = tissue.xpos.numpy()[0], np.zeros((2, len(points), 3), np.float32)
+  force[1, top] = 0.05, 0.0, 0.1
+  tissue.applied.assign(force)
+  data.xfrc_applied[model.flex_vertbodyid[top], :3] = force[1, top]
+  batch.step(100)
+  mujoco.mj_step(model, data, 100)
+  found = tissue.xpos.numpy()
+  assert np.linalg.norm(found[1, top] - rest[top]) > 1e-4
+  np.testing.assert_allclose(found[1], single.xpos, atol=2e-6)
+  np.testing.assert_allclose(found[0], rest, atol=1e-6)
+  batch.reset(np.array([False, True]))
+  batch.step(5)
+  np.testing.assert_allclose(tissue.xpos.numpy(), [rest, rest], atol=1e-6)

@@ -227,6 +227,40 @@ def masses(thread):
   ) / (2 * half.sum())
 
 
+def drawn(turns, force=2.0, steps=240):
+  """Returns the nodes of a knot that all four strands have drawn tight, see `throws` [m]."""
+  points, first, last = throws(turns, RADIUS, 2.5 * RADIUS)
+  nodes = first, last, 0, len(points) - 1
+  hands = [(node, (np.sign(points[node, 0]), 0, 0)) for node in nodes]
+  model, data, thread = load(points, hands, damping=20.0, material="silk", size="3-0", strength=0)
+  for k in range(steps):
+    data.ctrl[:] = force * min(1.0, k / 200)
+    mujoco.mj_step(model, data)
+  return thread.positions
+
+
+def with_loose_tails(points, random, step=3e-4):
+  """Returns a thread whose ends go on, turning at random."""
+  tails = []
+  for end, way in ((points[0], points[0] - points[1]), (points[-1], points[-1] - points[-2])):
+    way, places = way / np.linalg.norm(way), [end]
+    for _ in range(random.randint(20, 100)):
+      way = way + 0.25 * random.normal(size=3)
+      way /= np.linalg.norm(way)
+      places.append(places[-1] + step * way)
+    tails.append(places[1:])
+  return np.concatenate([tails[0][::-1], points, tails[1]])
+
+
+def sewn(turns, segment):
+  """Returns the nodes of a thread through the marks of the drain, with throws on top [m]."""
+  knot, first, last = throws(turns, RADIUS, 0.5 * segment, ear=7e-3)
+  up = np.array([0, 0, drain.HIGH + 1e-3])
+  side = np.sign(knot[first, 0]) * np.array([0.5 * drain.BITE, 0, 0])
+  chord = np.linspace(drain.MIDDLE + side, drain.MIDDLE - side, 20)
+  return resampled(np.concatenate([knot[:first] + up, chord, knot[last + 1 :] + up]), segment)
+
+
 def stitch(nodes, window=0, segment=4.5e-4, **thread):
   """Returns a stitch through a slit drain with a square knot on top, its ends in hands.
 
@@ -239,11 +273,7 @@ def stitch(nodes, window=0, segment=4.5e-4, **thread):
   Returns:
     model, data and the thread, of some hundred nodes
   """
-  knot, first, last = throws((1, -1), RADIUS, 0.5 * segment, ear=7e-3)
-  up = np.array([0, 0, drain.HIGH + 1e-3])
-  side = np.sign(knot[first, 0]) * np.array([0.5 * drain.BITE, 0, 0])
-  chord = np.linspace(drain.MIDDLE + side, drain.MIDDLE - side, 20)
-  points = resampled(np.concatenate([knot[:first] + up, chord, knot[last + 1 :] + up]), segment)
+  points = sewn((1, -1), segment)
   spec = drain.build(Scene(instrument="knot_pusher", nodes=nodes), points, **thread)
   if window:
     palpate.add_windows(spec, ORGAN, nodes=window)

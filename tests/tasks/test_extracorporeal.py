@@ -80,14 +80,14 @@ def test_a_broken_thread_fails_and_a_test_pulls_at_the_wall_beyond_the_marks():
   env = load()
   env.reset()
   model, data = env.physics.model.ptr, env.physics.data.ptr
-  drain.part(env.physics.organ, 400, 0.5)
+  drain.part(env.physics, env.task, 0.5)
   pulled = np.flatnonzero(data.xfrc_applied[:, 0])
   force, x = data.xfrc_applied[pulled, :3], data.xpos[pulled, 0]
   np.testing.assert_array_equal(np.sign(force[:, 0]), np.sign(x))
   assert np.abs(x).min() > 0.5 * drain.BITE - 1e-4  # the lips are not pulled
   for side in (x < 0.0, x > 0.0):
     assert np.linalg.norm(force[side].sum(axis=0)) == pytest.approx(0.5)
-  drain.part(env.physics.organ, 400, 0.0)
+  drain.part(env.physics, env.task, 0.0)
   for name in ("hand_post", "hand_tail"):
     data.ctrl[mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)] = 40.0
   while not env.step(np.zeros(4)).last():
@@ -99,7 +99,7 @@ def test_the_test_of_a_knot_pulls_and_does_not_kick():
   env = load("extracorporeal_standard")
   env.reset()
   physics, task = env.physics, env.task
-  task.free, task.gap = 0.28, 0.0  # closed, and the pull is about to begin
+  task.free, task.gap, task.left = 0.28, 0.0, 0.0  # closed, and the pull is about to begin
   for _ in range(4):
     task.judge(physics)
     before = physics.nodes()

@@ -5,17 +5,25 @@ import numpy as np
 import pytest
 import warp as wp
 from devices import needs_cuda
+from palpate.models import wrist
 from palpate.tasks import suite
 from palpate.tasks.batch import throws
 from palpate.tasks.batch.fields import Common
-from palpate.tasks.core import episode, performer
+from palpate.tasks.batch.vector import Exercises
+from palpate.tasks.core import episode, performer, rules
 from palpate.tasks.domains.suturing import drain, extracorporeal
+from palpate.tasks.domains.suturing.tie import flat
 from palpate.tasks.metrics import knots
 from palpate.tasks.recording import Recording
 from palpate.tissue.types import DIMS, allocate
 from scenes import threads
 
 OPEN, SHUT = 0.2, -0.76  # actions of the jaws
+DEVICES = [
+  "cpu",
+  pytest.param("warp-cpu", marks=pytest.mark.slow),
+  pytest.param("cuda:0", marks=needs_cuda),
+]
 STRENGTH = 9.4  # of silk of size 3-0 [N]
 
 
@@ -90,6 +98,127 @@ def test_a_throw_counts_once_it_is_tied_as_often_as_asked(level, counts):
   assert 0.4 < progress < 0.6 if counts else progress == 0.0  # the slit gapes
 
 
+@pytest.fixture
+def env():
+  """An exercise of two throws, whose jaws have let go of the thread and are out of the way."""
+  env = load("standard", turns=(1, 1))
+  env.reset()
+  for k, (hand, side) in enumerate(zip(env.physics.hands, (1, -1), strict=True)):
+    rules.hold(env.physics, k, -1, np.zeros(3), False)
+    place = np.array([0.045 * side, 0.02, 0.06])
+    hand.set_joints(wrist.inverse(hand.trocar(), place, flat(side)))
+  env.task.held[:] = -1
+  return env
+
+
+def lay(env, turns):
+  """Lays the thread through the drain, with throws on top; returns the progress."""
+  physics, line = env.physics, threads.sewn(turns, drain.EDGE)
+  more = len(physics.thread.positions) - len(line)  # of the long tail
+  tail = line[0] + np.arange(more, 0, -1)[:, None] * (line[0] - line[1])
+  drain.sew(physics.organ, np.concatenate([tail, line]))
+  physics.forward()
+  return [env.task.advance(physics) for _ in range(10)][-1]
+
+
+def draw(env, pull):
+  """Draws both ends apart, as if hands held them, until a throw is down [N]."""
+  task, physics = env.task, env.physics
+  first = mujoco.mj_name2id(physics.model.ptr, mujoco.mjtObj.mjOBJ_BODY, f"{drain.THREAD}_0")
+  ends, seated = [first, first + len(physics.thread.positions) - 1], task.seated
+  for k in range(100):
+    task.firm[:] = 1
+    apart = np.sign(np.subtract(*physics.thread.positions[[0, -1], 0]))
+    physics.data.ptr.xfrc_applied[ends, 0] = min(1.0, k / 50) * pull * np.array([apart, -apart])
+    env.step(still(env))
+    if task.seated > seated:
+      break
+  physics.data.ptr.xfrc_applied[ends] = 0.0
+
+
+def test_throws_count_one_after_the_other_and_their_knot_is_let_go_of_and_tested(env):
+  task = env.task
+  assert 0.2 < lay(env, (1,)) < 0.3  # the slit gapes
+  assert task.tied == 1 and task.seated == 0
+  draw(env, 0.8)
+  assert task.tied == task.seated == 1 and task.progress == pytest.approx(0.45)
+  lay(env, (1, -1))
+  assert task.tied == 2 and task.seated == 1 and "tight" in task.instruct(env.physics)
+  draw(env, 1.5)
+  assert task.tied == task.seated == 2 and task.outcome is None
+  while not env.step(still(env)).last():
+    pass
+  assert task.outcome == "success" and task.firm.tolist() == [0, 0]
+  found = task.recorded(env.physics)
+  assert drain.PULL < found["security"] <= 2.0 and found["gap"] < drain.CLOSED < task.gap
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_knot_holds_in_many_worlds_what_it_holds_in_one(env, device):
+  """In one world is the thread of an environment whose knot is about to be tested."""
+  pytest.importorskip("gymnasium")
+  lay(env, (1, -1))
+  env.task.seated = 1
+  draw(env, 1.5)
+  worlds = Exercises(
+    num_envs=2, task="suture/knot_standard", device=device, turns=(1, 1), surroundings="none"
+  )
+  worlds.reset(seed=0)
+  (part,) = worlds.parts
+  part.batch.set_state(0, env.physics.data.ptr)
+  fields, rows = part.fields, part.states.rows
+  node, place, firm = (x.numpy() for x in (fields.held_node, fields.held_place, rows["firm"]))
+  node[:, 0] = -1
+  firm[0] = 0
+  for k, hand in enumerate(env.physics.hands):
+    name = f"{hand.prefix}{drain.THREAD}"
+    part.batch.thread(drain.THREAD).hold(name, node[k], place[k], firm[:, k].astype(bool))
+  fields.held_node.assign(node)
+  rows["firm"].assign(firm)
+  part.states.set("seated", np.array([2, 0]))
+  part.states.records.assign(part.states.table())
+  ended = {}
+  while 0 not in ended:
+    seen, *_, info = worlds.step(np.tile(still(env), (2, 1)))
+    for k in np.flatnonzero(info.get("_final_info", [])):
+      final = info["final_info"]
+      ended.setdefault(k, (final["outcome"][k], final["metrics"]))
+    if not env.task.outcome:
+      env.step(still(env))
+    if env.task.pulled < drain.PULL:
+      assert seen["gap"][0, 0] == pytest.approx(env.task.gap, abs=2e-4)
+  assert ended[0][0] == "success" and 1 not in ended
+  # It gapes with a jump.
+  assert ended[0][1]["knot_security"][0] == pytest.approx(env.task.security, abs=0.2)
+  assert ended[0][1]["final_gap"][0] == pytest.approx(env.task.left, abs=2e-4)
+  assert not part.organ.applied.numpy()[0].any()  # another episode has begun
+
+
+def test_a_knot_that_is_not_drawn_tight_does_not_hold(env):
+  lay(env, (1, -1))
+  env.task.seated = 2  # as if it were
+  while not env.step(still(env)).last():
+    pass
+  assert env.task.outcome == "missed" and env.task.security < drain.PULL
+  assert env.task.take_events()[-1].label == "the knot did not hold"
+
+
+@pytest.mark.parametrize("turns", [1, (), (2, 3)])
+def test_turns_are_one_or_two_of_each_throw(turns):
+  with pytest.raises(ValueError, match=r"expected 1 or 2 for each throw, such as \(2, 1, 1\)"):
+    load(turns=turns)
+
+
+def test_a_granny_does_not_count_and_is_to_be_taken_out(env):
+  env.task.seated = 1
+  assert lay(env, (1, 1)) == env.task.tied == 0.0
+  assert "take the last throw out" in env.task.instruct(env.physics)
+
+
+def test_a_throw_on_one_that_is_not_down_does_not_count(env):
+  assert lay(env, (1, -1)) == env.task.tied == 0.0
+
+
 def test_a_broken_thread_fails():
   env = load()
   env.reset()
@@ -105,14 +234,7 @@ def test_a_broken_thread_fails():
   assert step.last() and env.task.outcome == "damage"
 
 
-@pytest.mark.parametrize(
-  "device",
-  [
-    "cpu",
-    pytest.param("warp-cpu", marks=pytest.mark.slow),
-    pytest.param("cuda:0", marks=needs_cuda),
-  ],
-)
+@pytest.mark.parametrize("device", DEVICES)
 def test_jaws_of_many_worlds_hold_the_thread_as_those_of_one(device):
   """One world lifts it, the other one opens its jaws and lets it spring off.
 
@@ -157,33 +279,45 @@ def test_jaws_of_many_worlds_hold_the_thread_as_those_of_one(device):
 
 
 def test_throws_of_many_worlds_are_those_that_the_jones_polynomial_tells():
-  """Throws that are laid, and tangles at random."""
+  """Throws that are laid, drawn tight with tails anywhere, and tangles at random."""
   random, curves = np.random.RandomState(1), []
-  turns = (1,), (2,), (1, -1), (1, 1), (2, -1), ()
-  for each in turns[:-1]:
-    curves.append(threads.throws(each, 2e-4, 2e-4)[0])
+  laid = (1,), (2,), (1, -1), (1, 1), (2, -1), (2, 1), (2, -1, 1), (-2, 1, 1)
+  curves = [threads.throws(each, 2e-4, 2e-4)[0] for each in laid]
   curves.append(np.linspace(0.0, 0.1, 50)[:, None] * (1.0, 0.5, 0.1))
   curves += [random.normal(size=(11, 3)) * 0.01 for _ in range(60)]
+  for each in laid[2:]:
+    tight = threads.drawn(each)
+    curves += [threads.with_loose_tails(tight, random) for _ in range(4)]
   count = max(map(len, curves))
   for k, curve in enumerate(curves):  # as many nodes each
     at, own = np.linspace(0.0, len(curve) - 1.0, count), np.arange(len(curve))
     curves[k] = np.stack([np.interp(at, own, x) for x in curve.T], axis=1)
-  expected = []
-  for curve in curves:
-    found = knots.throws(knots.closed(curve), 1)
-    expected.append(-1 if found is None else sum(map(abs, found)))
-  assert expected[: len(turns)] == [1, 2, -1, -1, -1, 0] and set(expected[len(turns) :]) > {0, 1}
   dims = {dim for each in DIMS[Common.key].values() for dim in each if isinstance(dim, str)}
   sizes = dict.fromkeys(dims, 1) | {"nworld": len(curves), "nnode": count, "ncrossing": throws.MOST}
   s = allocate(Common, "cpu", sizes)
   s.strand.assign(np.array(curves, np.float32))
   s.views.assign(throws.views())
   found = wp.zeros(len(curves), dtype=int, device="cpu")
-  wp.launch(throw_of_each, dim=len(curves), inputs=[s, found], device="cpu")
-  assert found.numpy().tolist() == expected
+  for turns, first in (
+    ((1,), [1, 0, -1, -1, -1, -1, -1, -1, 0]),
+    ((2,), [0, 1, -1, -1, -1, -1, -1, -1, 0]),
+    ((1, 1), [1, 0, 2, 0, 0, 0, -1, -1, 0]),
+    ((2, 1, 1), [0, 1, 0, 0, 2, 0, 3, 0, 0]),
+  ):
+    expected = []
+    for curve in curves:
+      told = knots.throws(knots.closed(curve), len(turns))
+      same = [k for k in range(len(turns) + 1) if told is not None and knots.same(told, turns[:k])]
+      expected.append(-1 if told is None else max(same, default=0))
+    assert expected[: len(first)] == first and set(expected[len(first) :]) >= {0, -1}
+    wp.launch(
+      tied_of_each, dim=len(curves), device="cpu",
+      inputs=[s, wp.array(turns, dtype=int, device="cpu"), found],
+    )  # fmt: skip
+    assert found.numpy().tolist() == expected, turns
 
 
 @wp.kernel
-def throw_of_each(s: Common, found: wp.array[int]):
+def tied_of_each(s: Common, turns: wp.array[int], found: wp.array[int]):
   w = wp.tid()
-  found[w] = throws.throw(s, w)  # pyright: ignore[reportIndexIssue, reportArgumentType]
+  found[w] = throws.tied(s, w, turns)  # pyright: ignore[reportIndexIssue, reportArgumentType]

@@ -123,7 +123,7 @@ class Organ(Tissue):
       mask=batch.mask,
       **arrays_of(patch.Patch, m, d),
     )
-    self._cuts = None
+    self._cuts, self._applied = None, None
     if organ.mesh.spare:
       self._cuts = Cuts(self, values, surface)
     self.patch = patch.make(values, self.body)
@@ -218,6 +218,9 @@ class Organ(Tissue):
     self._over(patch.tell_tools, max(1, p.ntool))
     self._lay_lines()
     self._over(patch.enter, p.nnode)
+    if self._applied is not None:
+      dim, device = self._applied.shape[:2], self.body.device
+      wp.launch(kernels.apply, dim=dim, inputs=[p, self._applied], device=device)
     if not self.sews:
       self._enter()
     some = min(p.nnode, _RANKED * p.nslot)  # threads, for as many candidates as there mostly are
@@ -284,6 +287,10 @@ class Organ(Tissue):
     """Puts the worlds of the mask at rest."""
     self._over(patch.rest, self.patch.nnode)
     self.host.rest()
+    if self._applied is not None:
+      rows = self._applied.reshape((self.batch.nworld, -1))
+      inputs = [self.batch.mask, self._unforced, rows]
+      wp.launch(kernels.put_back_rows, dim=rows.shape, inputs=inputs, device=rows.device)
     if self._cuts:
       self._cuts.heal()
 
@@ -338,6 +345,16 @@ class Organ(Tissue):
     p = self._pressed
     wp.launch(contact_rows.press, dim=p.geom.shape, inputs=[p], device=self.body.device)
     return Contacts(p.geom, p.normal.view(float), p.pressed)
+
+  @property
+  def applied(self) -> wp.array:
+    """Force applied to each vertex, see `Tissue`."""
+    if self._applied is None:
+      shape = self.batch.nworld, self.nvert, 3
+      self._applied = wp.zeros(shape, dtype=float, device=self.body.device)
+      self._unforced = wp.zeros((1, 3 * self.nvert), dtype=float, device=self.body.device)
+      self.batch.record()
+    return self._applied
 
   # Cuts.
 

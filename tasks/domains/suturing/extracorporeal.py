@@ -11,21 +11,16 @@ Own observations, in the world: `target` (3,), from the tip to where the throw i
 mark that the pusher is to go back to [m]; `throw` (3,), from the tip to the throw [m]; `gap` (1,),
 of the slit [m]; `tension` (1,), the largest of the thread [N]; `seated` (1,), throws that are.
 
-A knot of several throws is then tested: the strands are let go, and the wall on both sides of the
-stitch is lifted and pulled apart, harder and harder to 2 N.
-
 Progress: (seated + 0.9 * closeness of the throw to its seat, 0 at the least) / throws. Success: all
-throws are seated; of several the knot is right, see `palpate.tasks.metrics.knots`, the slit is
-closed to 1 mm when the strands are let go, and gapes less than unsewn, 2.4 mm, up to a pull of
-0.6 N, with which its strands were drawn.
-The pull at which it gapes so is the knot's security. Failure: a knot that is not so, a thread that
-breaks or tears out of the drain, a force above the damage limit, or the time limit.
+throws are seated; of several the knot is right, see `palpate.tasks.metrics.knots`, and holds in its
+test, see `drain.Sewn`. Failure: a knot that is not so, a thread that breaks or tears out of the
+drain, a force above the damage limit, or the time limit.
 
 It has no vectorised form: a batch cannot lay a thread and sew it while it runs.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -33,7 +28,7 @@ from palpate.models import trocar
 
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.rules import closeness
+from ...core.rules import RUNNING, SUCCESS, closeness
 from ...core.scenes import CONTACT, Scene
 from ...metrics import knots
 from ...registry import exercise
@@ -56,8 +51,6 @@ _PAST = 6e-4  # from strands that cross over it to between them [m]
 _TOUCH = 1.5 * EDGE  # between nodes of strands that touch [m]
 _SEAT = 0.003  # a throw no higher over the holes is down [m]
 _SNUG = 0.0018  # of a strand in a throw that is drawn tight, at most, for each half turn [m]
-_LET_GO = 0.3  # strands lie so long before the knot is tested [s]
-_HOLDS, _LAST, _RISES = PULL, 2.0, 2.0  # pull that it is to hold, the last [N], and the rise [N/s]
 _TRIES, _LIFT = 6, np.array([0.0, 0.0, 0.002])  # of the expert at a throw, and between them [m]
 _THERE = 0.002  # from the mark, where throws are laid [m]
 _MARK = 0.018  # height of the mark over the drain [m]
@@ -84,19 +77,9 @@ def hard(**kwargs):
 class Extracorporeal(drain.Sewn):
   """Push throws down with a knot pusher."""
 
-  def __init__(self, scene: Scene, random=None, *, turns: Sequence[int], **kwargs):
-    """Makes the task.
-
-    Args:
-      scene: of the exercise
-      random: see Task
-      turns: how often the strands wind about each other in each throw, (1, 1) of a square knot,
-        (2, 1, 1) of a surgeon's
-      **kwargs: see Task
-    """
-    self.turns, self.throws = tuple(turns), len(turns)
-    kwargs = {"force_limit": 3.0, "damage": 6.0, **kwargs}
-    super().__init__(scene, random, **kwargs)
+  def __init__(self, scene: Scene, random=None, **kwargs):
+    """Makes the task; see `Sewn`."""
+    super().__init__(scene, random, **{"force_limit": 3.0, "damage": 6.0, **kwargs})
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: the drain, its thread, and a slide for each of its ends."""
@@ -137,12 +120,11 @@ class Extracorporeal(drain.Sewn):
       name: np.array([(places[node] - physics.model.ptr.body(name).pos) @ way])
       for name, node, way in _ends(len(places))
     }
-    self.laid, self.seated, self.stayed, self.free = 1, 0, 0.0, 0.0
+    self.laid, self.stayed = 1, 0.0
     self.high0 = HIGH
-    self.left = drain.GAPE  # gap before the knot was pulled at
     self.below = self.sunk = 0.0
     self.slack = False
-    self.knot, self.pulled, self.held = "", 0.0, 0.0
+    self.knot = ""
     self.stitch, self.throw = MIDDLE, post[1:-1].mean(axis=0)
 
   def pull(self, physics: Physics, force: float) -> None:
@@ -198,27 +180,18 @@ class Extracorporeal(drain.Sewn):
       return 1.0
     if not self.free:
       self.pull(physics, 0.0)
-    if not self.pulled:
-      self.left = self.gap
-    if self.gap < drain.GAPE:
-      self.held = self.pulled
-    gapes = self.left > CLOSED and self.free > _LET_GO - 1e-6
-    if gapes or self.gap > drain.GAPE or self.pulled == _LAST:
-      assert physics.thread
-      places = knots.closed(physics.thread.positions, np.array([-1.0, 0.0, 0.0]))
-      self.knot = knots.name(places)
-      wound = [-self.hand * (-1) ** k * turns for k, turns in enumerate(self.turns)]
-      right = sorted(knots.throws(places) or ()) == sorted(wound)
-      if right and self.held > _HOLDS - 1e-6:
-        self.outcome = "success"
-        return 1.0
-      self.outcome = "missed"
-      self.event(physics, "note", label="the knot did not hold" if right else "a wrong knot")
+    _, outcome = drain.pull_test(physics, self)
+    if outcome == RUNNING:
       return 0.95
-    self.free += self.control_timestep
-    self.pulled = float(np.clip(_RISES * (self.free - _LET_GO), 0.0, _LAST))
-    drain.part(physics.organ, self.scene.nodes, self.pulled)
-    physics.forward()  # or the tissue's next step would not know of it, and throw the wall up
+    assert physics.thread
+    places = knots.closed(physics.thread.positions, np.array([-1.0, 0.0, 0.0]))
+    self.knot = knots.name(places)
+    right = knots.same(knots.throws(places) or (), self.turns)
+    if right and outcome == SUCCESS:
+      self.outcome = "success"
+      return 1.0
+    self.outcome = "missed"
+    self.event(physics, "note", label=self.label("missed") if right else "a wrong knot")
     return 0.95
 
   def tie(self, physics: Physics) -> None:
@@ -263,13 +236,6 @@ class Extracorporeal(drain.Sewn):
     """Marks where the pusher is to go back to."""
     waits = self.laid == self.seated < self.throws
     physics.mark(0, self.mark, waits, waits, 0.001)
-
-  def recorded(self, physics: Physics) -> dict[str, float]:
-    """Returns what the knot held as well, and the gap before it was pulled at."""
-    found = super().recorded(physics)
-    if self.pulled:
-      found["gap"] = self.left
-    return found | ({"security": self.held} if self.throws > 1 else {})
 
   def instruct(self, physics: Physics) -> str:
     """Says what is next."""

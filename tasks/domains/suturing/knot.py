@@ -1,11 +1,12 @@
-"""Knot: tie a throw inside the body, on a slit Penrose drain, with two wristed needle drivers.
+"""Knot: tie a knot inside the body, on a slit Penrose drain, with two wristed needle drivers.
 
-FLS task 5, once the needle is through, up to its first throw. The thread goes through the marks of
-the drain, see `drain`: its short tail stands free on the right, its long one is in the right hand.
-One hand winds the long tail around the other's jaws, once or twice, which take the short tail and
-draw it through; both hands draw the throw down. Further throws are not in it: outside of its holes
-the thread does not meet the drain, and throws slide along a tail that is taut before the other one,
-past both holes. Pulled apart, the slit then is held by the friction of the holes alone.
+FLS task 5, once the needle is through. The thread goes through the marks of the drain, see `drain`:
+its short tail stands free on the right, its long one is in the right hand. One hand winds the long
+tail around the other's jaws, once or twice, which take the short tail and draw it through; both
+hands draw the throw down. The levels end with this throw, and so does the expert. Where `turns`
+asks for several, each goes the other way round than the one before. Outside of its holes the thread
+does not meet the drain, and throws slide along a tail that is taut before the other one, past both
+holes.
 
 Jaws that press on the thread hold it: an equality joins them to the node that is between them.
 Threads meet the jaws as round, smooth bodies, on which a loop slides off: the inserts, whose
@@ -13,16 +14,22 @@ friction holds a thread, have corners.
 
 Own observations, in the world: `short_tail` (3,) and `long_tail` (3,), from the right tip to the
 ends of both tails [m]; `stitch` (3,), from there to the middle of the stitch [m]; `gap` (1,), of
-the slit [m]; `tension` (1,), the largest of the thread [N]; `tied` (1,), whether the thread has the
-throw; `right_holds` (1,), `left_holds` (1,), whether a hand holds the thread.
+the slit [m]; `tension` (1,), the largest of the thread [N]; `tied` (1,), how many throws the thread
+has; `right_holds` (1,), `left_holds` (1,), whether a hand holds the thread.
 
-Success: the thread has the throw, see `palpate.tasks.metrics.knots`, and the slit is closed to
-1 mm, for 0.3 s. Progress: 0.9 * closing of a throw that is tied, closing from 0.5 to 1 by the gap.
-Failure: a thread that breaks or tears out of the drain, a force above the damage limit, or the time
-limit.
+A throw is down when the thread has it, see `palpate.tasks.metrics.knots`, and the slit is closed to
+1 mm, for 0.3 s; throws after the first one when both hands draw with 0.5 N as well. They count one
+after the other: a throw on one that is not down does not, and neither does one of the wrong turns
+or direction; it is to be taken out again.
+
+Success: all throws are down, and of several the knot holds in its test, see `drain.Sewn`: what jaws
+hold is freed for it. Progress: 0.9 * (tied - 1 + closing) / throws, closing from 0.5 to 1 by the
+gap, and 0 where none is tied. Failure: a knot that does not hold, a thread that breaks or tears out
+of the drain, a force above the damage limit, or the time limit.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import mujoco
@@ -50,7 +57,7 @@ from ...core.rules import (
   reach,
   strand,
   strands,
-  throw,
+  tied,
   tip,
   vector,
 )
@@ -58,15 +65,16 @@ from ...core.scenes import Scene
 from ...core.stage import STATE, Stage
 from ...registry import exercise
 from . import drain
-from .drain import CLOSED, EDGE, GAPE, HANDS, MIDDLE, STAYS, follow_stitch
+from .drain import CLOSED, EDGE, GAPE, HANDS, MIDDLE, STAYS, follow_stitch, pull_test
 from .tie import GRIP, HOLD, START, Tie, X, Z, facing, flat
 
 FIELD = Scene(
   instrument="psm", second="psm", port=(0.08, -0.03, 0.12), second_port=(-0.08, -0.03, 0.12),
   camera=(0.0, -0.1, 0.06), nodes=400,
 )  # fmt: skip
-# Tails: the short one; the long one to where it is held, by the turns, and beyond [m].
-SHORT, LONG, BEYOND = 0.019, {1: 0.042, 2: 0.052}, 0.01
+# Tails: the short one; the long one to where it is held, by the first turns, and beyond, for one
+# throw and for several [m].
+SHORT, LONG, BEYOND, FURTHER = 0.019, {1: 0.042, 2: 0.052}, 0.01, 0.02
 _LEAN = np.array([0.8, 0.0, 0.6])  # of the short tail
 # From the stitch to where the long tail is held, but for its height, and how far both are off [m].
 _ASIDE, _OFF = np.array([-0.003, -0.012, 0.0]), np.array([0.0015, 0.0015, 0.0])
@@ -81,34 +89,42 @@ _ROUND, _CLEVIS, _JAW, _LINK, _STEEL = 0.001, 0.0026, 0.0102, 0.0091, (0.1, 0.00
 _SHUT, _ACROSS_IT, _BESIDE_IT, _ALONG_IT, _PADS = 0.08, 0.0004, 0.0009, 0.0026, 0.0036
 _HIGH = float(MIDDLE[2])  # of the stitch [m]
 _LOOKS = 10  # control steps after which the knot is looked at
+_DRAWN = 0.5  # tension of a throw that is drawn on another one [N]
 
 
 @exercise("suture/knot_easy", 40, "easy", "bimanual")
 def easy(**kwargs):
   """Tie one throw with two needle drivers, and close the slit to 1 mm."""
-  return Knot(FIELD, **{"turns": 1, **kwargs})
+  return Knot(FIELD, **{"turns": (1,), **kwargs})
 
 
 @exercise("suture/knot_standard", 40, "bimanual")
 def standard(**kwargs):
   """Tie a double throw, the first one of a surgeon's knot."""
-  return Knot(FIELD, **{"turns": 2, **kwargs})
+  return Knot(FIELD, **{"turns": (2,), **kwargs})
 
 
 class State:
   """State of a world."""
 
   control_timestep: float  # [s]
-  turns: int
+  turns: Annotated[Any, ints("throws")]  # of each throw
+  throws: int
   lips: Annotated[Any, ints("pairs", 2)]  # vertices of both lips beside the stitch
+  wall: Annotated[Any, ints("walls", 2)]  # that the test pulls at
   held: Annotated[Any, ints(2)]  # node that each hand holds, or held until it opens; -1 for none
   firm: Annotated[Any, ints(2)]  # whether it holds it
   anchors: Annotated[Any, Array(wp.vec3, (2,))]  # where in the frame of its tip [m]
   looked: int
   stayed: float  # how long the throw has been down [s]
+  seated: int  # throws that are
   whole: bool  # whether the thread is in both of its holes
   broken: bool  # whether it is broken
   gap: float
+  left: float  # before the test [m]
+  free: float  # how long the strands have been let go of for it [s]
+  pulled: float  # what the wall is pulled with [N]
+  security: float  # what the knot has held [N]
   tension: float
   hardest: float  # largest pull on the drain so far [N]
   tightest: float  # largest tension so far [N]
@@ -154,14 +170,14 @@ def follow_jaws(s, o, hand):
   """Lets jaws that press hold the node that they are around, and let go of it where they do not.
 
   The node stays theirs until they are open, without a force: the thread does not meet them till
-  then, as it is in them.
+  then, as it is in them. So it is while the knot is tested.
   """
   opening, target = jaws(s, hand)
   if opening > _SHUT:
     o.held[hand] = -1
     o.firm[hand] = 0
     hold(s, hand, -1, o.anchors[hand], False)
-  elif target > 0.0:
+  elif target > 0.0 or o.free > 0.0:
     o.firm[hand] = 0
     hold(s, hand, o.held[hand], o.anchors[hand], False)
   elif o.firm[hand] == 0:
@@ -189,22 +205,36 @@ def follow(s, o):
   o = follow_stitch(s, o)
   o.looked = o.looked + 1
   if o.looked % _LOOKS == 0:
-    found = throw(s)
+    found = tied(s, o.turns)
     if found >= 0:
-      o.tied = 1.0 if found == o.turns else 0.0
+      o.tied = float(found) if found <= o.seated + 1 else 0.0
   return o
 
 
+def is_down(o):
+  """Returns whether the throw whose turn it is is tied and drawn."""
+  if o.tied <= float(o.seated) or o.gap >= CLOSED:
+    return False
+  return o.seated == 0 or (o.firm[0] + o.firm[1] == 2 and o.tension > _DRAWN)
+
+
 def judge(s, o):
-  """Returns the progress of the throw; see the module's head."""
+  """Returns the progress of the knot; see the module's head."""
   if o.broken or not o.whole:
     return o, -1.0, DAMAGED
-  o.stayed = o.stayed + o.control_timestep if o.tied > 0.0 and o.gap < CLOSED else 0.0
+  if o.seated == o.throws:
+    o, outcome = pull_test(s, o)
+    return o, 0.95, outcome
+  o.stayed = o.stayed + o.control_timestep if is_down(o) else 0.0
   closing = clamp((GAPE - o.gap) / (GAPE - CLOSED), 0.0, 1.0)
-  progress = 0.45 * (1.0 + closing) if o.tied > 0.0 else 0.0
+  before = 2.0 * (o.tied - 1.0)
+  progress = 0.45 * (before + 1.0 + closing) / float(o.throws) if o.tied > 0.0 else 0.0
   if o.stayed > STAYS - 1e-6:
     reach(s, o, o.gap)
-    return o, progress, SUCCESS
+    if o.throws == 1:
+      return o, progress, SUCCESS
+    o.seated = o.seated + 1
+    o.stayed = 0.0
   return o, progress, RUNNING
 
 
@@ -230,11 +260,10 @@ def observe(s, o):
 
 
 class Knot(drain.Sewn):
-  """Tie a throw with two needle drivers.
+  """Tie a knot with two needle drivers.
 
   Attributes:
-    turns: how often the strands wind about each other
-    tied: whether they do
+    tied: throws that the thread has
     held, firm: what each hand holds, see `State`
   """
 
@@ -243,32 +272,30 @@ class Knot(drain.Sewn):
     advance,
     observe,
     ("short_tail", "long_tail", "stitch", "gap", "tension", "tied", "right_holds", "left_holds"),
-    metrics={"peak_traction": "hardest", "final_gap": "gap", "peak_tension": "tightest"},
+    metrics={
+      "peak_traction": "hardest", "final_gap": "left", "peak_tension": "tightest",
+      "knot_security": "security",
+    },
     begin=begin,
-    shared=("lips",),
-  )
+    shared=("turns", "lips", "wall"),
+  )  # fmt: skip
 
-  def __init__(self, scene: Scene, random=None, *, turns: int, **kwargs):
-    """Makes the task.
-
-    Args:
-      scene: what it plays in
-      random: see Task
-      turns: how often the strands wind about each other, once or twice
-      **kwargs: see Task
-    """
-    self.turns, self.lean, self.aside = turns, _LEAN, _ASIDE
+  def __init__(self, scene: Scene, random=None, *, turns: Sequence[int], **kwargs):
+    """Makes the task; see `Sewn`."""
+    self.lean, self.aside = _LEAN, _ASIDE
     # Jaws that close strike each other, and what they take, with 9 to 20 N in single steps.
-    super().__init__(scene, random, **{"force_limit": 30.0, "damage": 60.0, **kwargs})
+    kwargs = {"force_limit": 30.0, "damage": 60.0, **kwargs}
+    super().__init__(scene, random, turns=turns, **kwargs)
 
   def line(self) -> np.ndarray:
     """Returns the line of the thread, from the end of its long tail  (4, 3)."""
     mark = np.array([0.5 * drain.BITE, 0.0, 0.0])
-    start, far = MIDDLE - mark, LONG[self.turns]
+    start, far = MIDDLE - mark, LONG[self.turns[0]]
     way = MIDDLE + self.aside - start
     way[2] = math.sqrt(far**2 - way @ way)
     end = MIDDLE + mark + SHORT * self.lean / np.linalg.norm(self.lean)
-    return np.array([start + (1.0 + BEYOND / far) * way, start, MIDDLE + mark, end])
+    beyond = FURTHER if self.throws > 1 else BEYOND
+    return np.array([start + (1.0 + beyond / far) * way, start, MIDDLE + mark, end])
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: the drain, its thread, round jaws, and what joins a node to each hand."""
@@ -323,7 +350,7 @@ class Knot(drain.Sewn):
     thread.lay(line)
     self.threads = {thread.name: thread.positions}
     way = line[0] - line[1]
-    held = line[1] + LONG[self.turns] * way / np.linalg.norm(way)
+    held = line[1] + LONG[self.turns[0]] * way / np.linalg.norm(way)
     _, left = physics.hands
     # Its roll is where it can be turned on from.
     near = -math.pi
@@ -341,21 +368,27 @@ class Knot(drain.Sewn):
 
   def instruct(self, physics: Physics) -> str:
     """Says what is next."""
-    if self.tied:
-      return "Draw both tails apart until the slit is closed"
+    if self.seated == self.throws:
+      return "The strands are let go of, and the slit is pulled apart"
+    if self.tied > self.seated:
+      until = "throw is tight" if self.seated else "slit is closed"
+      return f"Draw both tails apart until the {until}"
+    if self.tied < self.seated:
+      return "This is another knot than was asked for: take the last throw out again"
     if not any(self.firm):
       return "Take the long tail"
-    times = ("once", "twice")[self.turns - 1]
+    times = ("once", "twice")[self.turns[self.seated] - 1]
+    way = ", the other way round than before" if self.seated else ""
     return (
-      f"Wind the long tail {times} around the other jaws, take the short tail with them, and draw "
-      "it through"
+      f"Wind the long tail {times} around the other jaws{way}, take the short tail with them, and "
+      "draw it through"
     )
 
   def expert(self, p: Performer) -> Script:
     """The right hand winds, the left one draws the short tail through."""
     tie = Tie(self, p)
     yield from p.wait(0.1)
-    yield from tie.wind(1, self.turns)
+    yield from tie.wind(1, self.turns[0])
     yield from tie.draw(1)
     yield from tie.tighten(1)
 

@@ -116,13 +116,13 @@ _TUG, _ASIDE = 0.02, 0.03
 @exercise("suture/stitch_easy", 60, "easy", "bimanual")
 def easy(**kwargs):
   """Drive a needle through both lips of a slit within 2 mm of its marks, and tie one throw."""
-  return Stitch(FIELD, **{"turns": 1, "tolerance": 0.002, **kwargs})
+  return Stitch(FIELD, **{"turns": (1,), "tolerance": 0.002, **kwargs})
 
 
 @exercise("suture/stitch_standard", 60, "bimanual")
 def standard(**kwargs):
   """Drive it within 1 mm, as FLS asks for, and tie a double throw."""
-  return Stitch(FIELD, **{"turns": 2, "tolerance": 0.001, "jitter": 0.002, **kwargs})
+  return Stitch(FIELD, **{"turns": (2,), "tolerance": 0.001, "jitter": 0.002, **kwargs})
 
 
 class State(knot.State, Hands):
@@ -234,24 +234,23 @@ class Stitch(Knot, Stitching):
     (*Knot.rules.observed, "target", "circle", "needle", "pierced", "attached"),
     metrics={**Knot.rules.metrics, "tearing": "torn", "regrasps": "regrasps"},
     begin=begin,
-    shared=("lips", "marks"),
+    shared=("turns", "lips", "wall", "marks"),
     mark=mark_hole,
   )
   targets = 2
 
-  def __init__(self, scene: Scene, random=None, *, turns: int, tolerance: float, **kwargs):
+  def __init__(self, scene: Scene, random=None, *, tolerance: float, **kwargs):
     """Makes the task.
 
     Args:
       scene: of the exercise
       random: see Task
-      turns: see `Knot`
       tolerance: largest distance of holes from their marks [m]
-      **kwargs: see Task
+      **kwargs: see `Knot`
     """
     self.tolerance = tolerance
     self.marks = drain.MIDDLE + np.outer([0.5, -0.5], [drain.BITE, 0.0, 0.0])
-    super().__init__(scene, random, turns=turns, **kwargs)
+    super().__init__(scene, random, **kwargs)
 
   def build(self, variant: int | None, nodes: np.ndarray) -> mujoco.MjSpec:
     """Returns the tube, and the thread with its needle, away from it until an episode begins."""
@@ -331,7 +330,7 @@ class Stitch(Knot, Stitching):
     yield from one(p, left, self._draw(left))
     yield from tie.catch(1, round(BEYOND / drain.EDGE))
     yield from one(p, left, self._pull_off(left))
-    yield from tie.wind(1, self.turns)
+    yield from tie.wind(1, self.turns[0])
     yield from tie.draw(1)
     yield from tie.tighten(1)
 

@@ -163,6 +163,11 @@ const GERMAN = {
     "Wickle das lange Ende einmal um die anderen Backen, nimm das kurze damit und ziehe es hindurch",
   "Wind the long tail twice around the other jaws, take the short tail with them, and draw it through":
     "Wickle das lange Ende zweimal um die anderen Backen, nimm das kurze damit und ziehe es hindurch",
+  "Wind the long tail once around the other jaws, the other way round than before, take the short tail with them, and draw it through":
+    "Wickle das lange Ende andersherum als zuvor einmal um die anderen Backen, nimm das kurze damit und ziehe es hindurch",
+  "Draw both tails apart until the throw is tight": "Ziehe beide Enden auseinander, bis der Wurf fest ist",
+  "This is another knot than was asked for: take the last throw out again": "Das ist ein anderer Knoten als verlangt: löse den letzten Wurf wieder",
+  "The strands are let go of, and the slit is pulled apart": "Die Enden sind losgelassen, und der Schlitz wird auseinandergezogen",
   "Slack is left below the throw: lift the pusher a little, and push again": "Unter dem Wurf ist noch loser Faden: hebe den Schieber etwas an und schiebe erneut",
   "Push throw # of # down until the slit is closed": "Schiebe Wurf # von # hinunter, bis der Schlitz zu ist",
   "Take the pusher back up to the yellow mark": "Nimm den Schieber zurück bis zur gelben Marke",
