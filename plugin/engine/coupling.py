@@ -290,8 +290,7 @@ def crossing(arrays: dict[str, wp.array]):
 
 def mass_addresses(m: mjstruct.Struct, dofs: np.ndarray) -> np.ndarray:
   """Returns where the diagonal of each dof lies in mjData.M, the inertia that MuJoCo uses."""
-  rowadr = mjstruct.view(m.M_rowadr, m.nv, np.int32)[dofs]
-  return rowadr + mjstruct.view(m.M_rownnz, m.nv, np.int32)[dofs] - 1
+  return m.M_rowadr[dofs] + m.M_rownnz[dofs] - 1
 
 
 def outer(organ: "Declaration") -> int:
@@ -356,6 +355,6 @@ def check_state(organ: "Declaration", state: np.ndarray):
 
 def plugin_state(model: int, data: int, instance: int, size: int) -> wp.array:
   """Returns an organ's part of mjData.plugin_state."""
-  m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
-  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
-  return wrap(d.plugin_state + 8 * start, size)
+  m, d = mjstruct.both(model, data)
+  start = int(m.plugin_stateadr[instance])
+  return wrap(d.raw.plugin_state + 8 * start, size)

@@ -236,7 +236,7 @@ class Host(abc.ABC):
   @property
   def m(self) -> Any:
     """The compiled mjModel's struct."""
-    return mjstruct.Model.from_address(self.model)
+    return mjstruct.model(self.model)
 
   @property
   def nnode(self) -> int:
@@ -246,7 +246,7 @@ class Host(abc.ABC):
   def may_move(self, body: int | np.ndarray) -> bool:
     """Returns whether one of these bodies may move: all but what is welded to the world."""
     m = self.m
-    return bool(mjstruct.view(m.body_weldid, m.nbody, np.int32)[body].any())
+    return bool(m.body_weldid[body].any())
 
   def zeros(self, *shape: int, dtype: Any = wp.float64) -> wp.array:
     """Returns an array with worlds in front."""

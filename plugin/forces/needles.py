@@ -211,7 +211,7 @@ class Needles(Force):
     thick = np.array([each["radius"] for each in found])
     length = 2 * self._shape["half"] * self._shape["circle"]
     self._margin = np.maximum(_MARGIN * (radius + thick), _POINT * length)
-    self.names = [mjstruct.name_of(m, m.name_bodyadr, int(b)) for b in body]
+    self.names = [mjstruct.name_of(m, "body", int(b)) for b in body]
     host.need_springs()
 
   def take(self, declared: "Needles", twin: Any):

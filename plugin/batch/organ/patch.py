@@ -8,7 +8,7 @@ import warp as wp
 from palpate.engine import coupling
 from palpate.engine.coupling import Crossing
 from palpate.engine.layout import GEOM
-from palpate.engine.model import inertia, mjstruct
+from palpate.engine.model import inertia
 from palpate.engine.windows import proxies
 from palpate.tissue import step
 from palpate.tissue.cutting.facets import World
@@ -200,7 +200,7 @@ class Surface:
     self._organ = organ
     margins = *model.geom_margin[tools], *(model.flex_margin[line.flex] for line in lines)
     self._reach = _skin(organ, model) + float(max(margins, default=0.0))
-    mass = inertia.masses(mjstruct.Model.from_address(model._address), organ)
+    mass = inertia.masses(model, organ)
     if organ.windows:
       self._held = proxies.hold(organ, mass)
     else:

@@ -9,7 +9,7 @@ from . import declare, mjstruct
 
 def state_size(model: int, instance: int) -> int:
   """Returns the length of the plugin state: at least what `coupling.sizes` will ask for."""
-  m = mjstruct.Model.from_address(model)
+  m = mjstruct.model(model)
   if declare.is_rod(model, instance):
     refine = mjstruct.config(model, instance, "refine").strip() not in ("", "0")
     return layout.size(RodState, layout.rod_sizes(m.nflexvert, m.nv, refine))

@@ -13,7 +13,6 @@ from palpate.tissue.types import doubles, fill, flags, floats, ints, longs, stru
 from .. import coupling
 from ..coupling import Mujoco
 from ..layout import FLAG, Inbox, Outbox, WindowState
-from ..model import mjstruct
 
 if TYPE_CHECKING:
   from ..host import Host
@@ -146,16 +145,10 @@ def make(
   """
   m, organ, win, mesh = host.m, host.organ, host.organ.window, host.organ.mesh
   lengths, longest = _edges(mesh)
-  radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex])
-  margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex])
-  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
-  thread = np.searchsorted(start, win.line, side="right") - 1  # the flex of each edge
-  margins = (
-    *mjstruct.view(m.geom_margin, m.ngeom)[win.geom],
-    *mjstruct.view(m.flex_margin, m.nflex)[thread],
-  )
-  margin += float(max(margins, default=0.0))
-  thick = mjstruct.view(m.flex_radius, m.nflex)[thread]
+  radius, margin = float(m.flex_radius[win.flex]), float(m.flex_margin[win.flex])
+  thread = np.searchsorted(m.flex_vertadr, win.line, side="right") - 1  # the flex of each edge
+  margin += float(max((*m.geom_margin[win.geom], *m.flex_margin[thread]), default=0.0))
+  thick = m.flex_radius[thread]
   room = max(mesh.whole.nelem, sizes["ncorner"])
   values = {**boxes} | {name: kept[name] for name in scratch(0, 0)} | dict(
     nvert=sizes["nvert"],
