@@ -130,7 +130,7 @@ def _held_share(mesh: Mesh, vert: np.ndarray, pins: tuple[int, ...]) -> np.ndarr
 class Attachments(Force):
   """The attachments of an organ, none at first."""
 
-  KEYS, WORLDS = ("attach", "carrier"), True
+  KEYS = ("attach", "carrier")
   ENTER, ACT = _enter, _act
 
   def __init__(self, host: Host):

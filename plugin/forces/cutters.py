@@ -100,7 +100,7 @@ class Cutters(Force):
     geoms: fields of `Blades` that say which they are
   """
 
-  KEYS, WORLDS = ("cutters",), True
+  KEYS = ("cutters",)
   ACT, END = _act, _keep
 
   def __init__(self, host: Host):

@@ -46,7 +46,7 @@ class Lipped:
 class Lips(Force):
   """The lips of an organ's cuts."""
 
-  KEYS, WORLDS, ENTER = ("spare",), True, _enter
+  KEYS, ENTER = ("spare",), _enter
 
   def __init__(self, host: Host):
     super().__init__(host)

@@ -40,7 +40,7 @@ _enter, _end = kernels("forces/relaxation.h", Relaxing, "enter_relaxation", "end
 class Relaxation(Force):
   """Stress relaxation of an organ."""
 
-  KEYS, WORLDS = ("relax_share",), True
+  KEYS = ("relax_share",)
   ENTER, END = _enter, _end
 
   def __init__(self, host: Host):

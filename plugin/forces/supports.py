@@ -87,7 +87,7 @@ class Supports(Force):
     below: supports of the organs that it rests on
   """
 
-  KEYS, WORLDS = ("support",), True
+  KEYS = ("support",)
   ENTER, END = _press, _keep
 
   def __init__(self, host: Host):
