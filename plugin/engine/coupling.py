@@ -179,9 +179,9 @@ CONSTANTS = {
 }  # fmt: skip
 
 
-def kernels(header: str, kind: Any, *names: str) -> list[Kernel]:
-  """Returns the kernels of a header that take a struct."""
-  return [kernel(name, header, kind, CONSTANTS) for name in names]
+def kernels(header: str, kind: Any, *names: str, own: bool = False) -> list[Kernel]:
+  """Returns the kernels of a header that take a struct, `own` as `kernel` does."""
+  return [kernel(name, header, kind, CONSTANTS, own=own) for name in names]
 
 
 def wrap(address: int, shape: Any, dtype: type = wp.float64) -> wp.array:

@@ -166,8 +166,9 @@ def kernel(
   return Kernel(struct, made(brought, "cuda", bounds), made(pointed, "cpu", None))
 
 
-# The first sizes of arrays with a row a world, or one of all; what says a world's row of others.
-_WORLDS = "nworld", "*"
+# The first sizes of arrays with a row a world, where "*" may be one row of all, and "nlump" none.
+# And what says a world's row of others.
+_WORLDS = "nworld", "*", "nlump"
 _ROW = {"nrow": "row", "nmesh": "mesh"}
 
 

@@ -28,7 +28,7 @@ _ASKED, _SHARE, _FIRM = (wp.constant(k) for k in (TISSUE.asked, TISSUE.share, TI
 _SMALL = tuple(int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
                for name in ("SPHERE", "CAPSULE", "CYLINDER"))  # fmt: skip
 # What of these fields are those of `Patch`.
-_OF_PATCH = ("nnode", "nslice", "nslot", "ntool", "ngeom", "mesh", "rest", "force", "slot_node",
+_OF_PATCH = ("nnode", "nslice", "nslot", "ntool", "mesh", "rest", "force", "slot_node",
              "tool", "tool_geom", "geom_xpos", "geom_xmat")  # fmt: skip
 
 
@@ -67,9 +67,8 @@ class Pressed:
   pressed: floats("nworld", "many")
 
 
-_find_series = kernel(
-  "find_series", "coupling/world_contacts.h", Pressed, coupling.CONSTANTS | TISSUE.constants()
-)
+_known = coupling.CONSTANTS | TISSUE.constants()
+_find_series = kernel("find_series", "coupling/world_contacts.h", Pressed, _known, own=True)
 
 
 @wp.func

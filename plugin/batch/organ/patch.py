@@ -47,14 +47,11 @@ class Patch:
   nslot: int  # slots
   ntool: int  # geoms that the slots follow, and after them edges of threads
   nline: int  # edges of threads
-  ngeom: int  # geoms of the model
   nq: int
   nv: int
-  nbody: int
   dofadr: int  # first dof of the slots
   qposadr: int  # their first number in qpos
   bodyid: int  # their first body
-  ngravity: int  # rows of `gravity`
   ngrade: int  # rows of `inertia`
   stiff: int  # whether the organ answers for itself, see `inertia.stiffness`
   sleeps: int  # whether it may sleep
@@ -118,6 +115,7 @@ tell_tools, enter, rank, stand, push, take, follow, commit, find_bad, rest = cou
   Patch,
   *("tell_tools", "enter_worlds", "rank", "stand", "push_worlds", "take", "follow"),
   *("commit_worlds", "find_bad", "rest_organ"),
+  own=True,
 )
 
 

@@ -1,19 +1,11 @@
 // Bodies of MuJoCo that an organ holds, or that hold it, by forces of its own.
 //
-// Kernels get what their world has of its own, see `kernels.kernel`: MuJoCo's doubles, of which there is one
-// world, or mujoco_warp's floats.
+// Kernels get what their world has of its own: MuJoCo's doubles, of which there is one world, or
+// mujoco_warp's floats.
 #pragma once
 #include "coupling/node.h"
 
 namespace palpate {
-
-// What leads arrays to a row, or to the only one; and the row of a world: the first where all have the same.
-template <class... Arrays>
-PALPATE void move_each(int row, Arrays&... arrays) {
-  ((arrays.data += (arrays.shape[0] > 1 ? row : 0) * ((size_t)arrays.strides[0] / sizeof(*arrays.data))), ...);
-}
-template <class Array>
-PALPATE int own_row(const Array& rows, int world) { return rows.data ? rows.data[world] : 0; }
 
 // A symmetric matrix, by its upper half.
 struct Sym { double xx, xy, xz, yy, yz, zz; };
