@@ -125,7 +125,7 @@ def _before(w: Workspace, model: int):
   """Returns what launches a step's work before the solve."""
   touched = _touched(w, model)
   m = mjstruct.model(model)
-  tools = penetration.speeds(m, model, w.data, w.organ, np.asarray(w.report.flags))
+  tools = penetration.speeds(m, w.data, w.organ, np.asarray(w.report.flags))
 
   def launch():
     contacts.launch(touched)

@@ -198,12 +198,10 @@ def _reach(found: list[np.ndarray]) -> np.ndarray:
   return np.array([np.linalg.norm(each, axis=1).max() for each in found])
 
 
-def speeds(
-  m: mjstruct.Struct, model: int, data: int, organ: "Declaration", flags: np.ndarray
-) -> Speeds:
+def speeds(m: mjstruct.Struct, data: int, organ: "Declaration", flags: np.ndarray) -> Speeds:
   """Returns `Speeds` of the tools of an organ."""
   geoms = tools(m, organ)
-  out = coupling.mujoco_arrays(model, data, Speeds)
+  out = coupling.mujoco_arrays(m.address, data, Speeds)
   out.ntool = len(geoms)
   out.tool = wp.array(geoms, dtype=int, device="cpu")
   out.reach = wp.array(_reach(points(m, geoms)), dtype=wp.float64, device="cpu")

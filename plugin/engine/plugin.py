@@ -122,7 +122,7 @@ def _nstate(model: int, instance: int) -> int:
 @signals.watch
 def _init(model: int, data: int, instance: int) -> int:
   try:
-    made = rods if declare.is_rod(model, instance) else workspace
+    made = rods if declare.is_rod(mjstruct.model(model), instance) else workspace
     w = made.make(model, data, instance)
     _workspaces[data, instance] = _states[w.plugin_state.ctypes.data] = w
     if isinstance(w, Workspace):

@@ -225,14 +225,13 @@ class Declaration:
     return ~(self.free[1:] | self.free[:-1])
 
 
-def read(model: int, instance: int) -> Declaration:
+def read(m: mjstruct.Struct, instance: int) -> Declaration:
   """Returns the thread that plugin instance `instance` of an mjModel declares.
 
   Raises:
     ValueError: the declaration is not one this plugin can run.
   """
   devices.init()
-  m = mjstruct.model(model)
   flex = declare.flex_of(m, instance)
   name = flexes.name(m, flex)
   _check(m, flex, name)
@@ -247,7 +246,7 @@ def read(model: int, instance: int) -> Declaration:
   length = np.linalg.norm(np.diff(rest, axis=0), axis=1)
   rod.check_edges(name, length, radius)
   rod.check_apart(name, rest, radius, NEIGHBOURS * radius, 2 * CORE * radius)
-  texts = declare.keys(model, instance)
+  texts = declare.keys(m, instance)
   try:
     config = configuration.parse(name, texts, len(edge), closed=False)
   except ValueError as error:
@@ -478,7 +477,8 @@ class Workspace:
 
 def make(model: int, data: int, instance: int) -> Workspace:
   """Returns a thread in a fresh mjData; makes the model fit it."""
+  m = mjstruct.model(model)
   with graphs.lock:
-    organ = read(model, instance)
-    prepare.fit_thread(mjstruct.model(model), organ.flex, organ.body[organ.free])
+    organ = read(m, instance)
+    prepare.fit_thread(m, organ.flex, organ.body[organ.free])
     return Workspace(organ, model, data, instance)

@@ -442,10 +442,10 @@ def attach(w: Workspace, model: int):
 
 def make(model: int, data: int, instance: int) -> Workspace:
   """Returns the workspace of an organ in a fresh mjData; makes the model fit the organ."""
-  has_windows = bool(mjstruct.config(model, instance, "window"))
+  m = mjstruct.model(model)
+  has_windows = bool(mjstruct.config(m, instance, "window"))
   with graphs.lock:
-    organ = (declare_windows if has_windows else declare).read(model, instance)
-    m = mjstruct.model(model)
+    organ = (declare_windows if has_windows else declare).read(m, instance)
     body = bodies.worlds(organ.still)
     host = Host(organ, body, data, model, instance)
     w = Workspace(host, Seen(instance), Report(host.flags().numpy().data))

@@ -81,7 +81,7 @@ def strand(host: Host, needle: int) -> dict[str, Any]:
       continue
     mine = slice(int(first[flex]), int(first[flex]) + flexes.vertices(m, flex))
     instance = int(m.body_plugin[body[mine][0]])
-    texts = declare.keys(host.model, instance)
+    texts = declare.keys(host.m, instance)
     where = declare.places(m, instance, flex, flexes.name(m, flex))
     rest, frame, origin = where[1], where[3], where[4]
     length = np.linalg.norm(np.diff(rest, axis=0), axis=1)

@@ -161,21 +161,20 @@ class Windows:
     return len(self.body)
 
 
-def read(model: int, instance: int) -> Declaration:
+def read(m: mjstruct.Struct, instance: int) -> Declaration:
   """Returns the organ that plugin instance `instance` of an mjModel declares.
 
   Raises:
     ValueError: the declaration is not one this plugin can run.
   """
   devices.init()
-  m = mjstruct.model(model)
   flex = flex_of(m, instance)
   name = flexes.name(m, flex)
   check_surface(m, flex, name)
   check_flex(m, flex, name)
   body, rest, free, frame, origin = places(m, instance, flex, name)
   nvert, parent = len(rest), find_parent(m, name, body, free)
-  config, mesh = read_mesh(m, name, keys(model, instance), rest, flex)
+  config, mesh = read_mesh(m, name, keys(m, instance), rest, flex)
   check_volume(name, mesh, config)
   if config.carrier and not free.all():
     raise ValueError(f"organ {name!r}: carrier is set and vertices are pinned, expected no <pin>")
@@ -234,9 +233,9 @@ def places(
   return body, rest, free, frame @ turn, origin
 
 
-def is_rod(model: int, instance: int) -> bool:
+def is_rod(m: mjstruct.Struct, instance: int) -> bool:
   """Returns whether a plugin instance is a thread's, see `rods`."""
-  return mjstruct.config(model, instance, "elements").strip() == "rod"
+  return mjstruct.config(m, instance, "elements").strip() == "rod"
 
 
 def read_mesh(
@@ -298,9 +297,9 @@ def cached(
     return _made[key]
 
 
-def keys(model: int, instance: int) -> dict[str, str]:
+def keys(m: mjstruct.Struct, instance: int) -> dict[str, str]:
   """Returns the configuration keys that are set."""
-  texts = {key: mjstruct.config(model, instance, key) for key in configuration.KEYS}
+  texts = {key: mjstruct.config(m, instance, key) for key in configuration.KEYS}
   return {key: text for key, text in texts.items() if text}
 
 

@@ -140,7 +140,7 @@ class Struct:
   """
 
   def __init__(self, kind: Any, address: int, model: Any = None):
-    self.raw, self._model = kind.from_address(address), model
+    self.raw, self.address, self._model = kind.from_address(address), address, model
 
   def __getattr__(self, name: str) -> Any:
     value = getattr(self.raw, name)
@@ -178,9 +178,9 @@ def both(model: int, data: int) -> tuple[Struct, Struct]:
   return m, Struct(Data, data, m)
 
 
-def config(model: int, instance: int, key: str) -> str:
+def config(m: Struct, instance: int, key: str) -> str:
   """Returns a plugin instance's configuration value, empty where it is not set."""
-  value = library().mj_getPluginConfig(model, instance, key.encode())
+  value = library().mj_getPluginConfig(m.address, instance, key.encode())
   return value.decode() if value else ""
 
 

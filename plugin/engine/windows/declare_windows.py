@@ -14,21 +14,20 @@ Frame = tuple[np.ndarray, np.ndarray]  # rotation to the world, and origin [m]
 _NEAR = 0.1  # of its size: closer than that to an organ, a flex is beside it
 
 
-def read(model: int, instance: int) -> Declaration:
+def read(m: mjstruct.Struct, instance: int) -> Declaration:
   """Returns the organ that plugin instance `instance` declares: a rigid flex, with windows.
 
   Raises:
     ValueError: the declaration is not one this plugin can run.
   """
   devices.init()
-  m = mjstruct.model(model)
   flex, parent = _surface(m, instance)
   name = flexes.name(m, flex)
   frame, origin = declare.static_frame(m, name, parent)
   nvert = flexes.vertices(m, flex)
   start = int(m.flex_vertadr[flex])
   rest = m.flex_vert[start : start + nvert].copy()
-  config, mesh = declare.read_mesh(m, name, declare.keys(model, instance), rest, flex)
+  config, mesh = declare.read_mesh(m, name, declare.keys(m, instance), rest, flex)
   declare.check_volume(name, mesh, config)
   if config.elements == "solid":
     mesh = declare.fill_inside(name, mesh, config)
@@ -41,8 +40,8 @@ def read(model: int, instance: int) -> Declaration:
     raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
   share = fill.vertex_volumes(mesh) if len(mesh.tet) else topology.vertex_areas(rest, mesh.elem)
   mass = config.mass * share / share.sum()
-  windows = _windows(model, m, instance, name, config, mesh, mass, (frame, origin))
-  _check_neighbours(m, model, instance, name, windows, frame, origin, rest)
+  windows = _windows(m, instance, name, config, mesh, mass, (frame, origin))
+  _check_neighbours(m, instance, name, windows, frame, origin, rest)
   absent = np.full(mesh.nvert, -1)
   return declare.cached(
     float(m.opt.timestep),
@@ -79,7 +78,6 @@ def _rigid_flexes(m: mjstruct.Struct, instance: int) -> tuple[np.ndarray, list[i
 
 
 def _windows(
-  model: int,
   m: mjstruct.Struct,
   instance: int,
   name: str,
@@ -89,7 +87,7 @@ def _windows(
   place: Frame,
 ) -> Windows:
   """Returns the window of an organ, and where it stands at rest."""
-  flex = _claimed(model, m, instance, name, config)
+  flex = _claimed(m, instance, name, config)
   body, dofadr, qposadr, offset, turn = _slots(m, name, config.window, flex, place)
   elem_num = int(m.flex_elemnum[flex])
   # At rest the window stands on a patch of its own: its bodies move there, so that qpos0 fits.
@@ -110,15 +108,15 @@ def _windows(
     elem_adr=int(m.flex_elemdataadr[flex]),
     elem_num=elem_num,
     geom=_followed(m, name, config, flex),
-    line=_lines(model, m, instance, config, flex),
+    line=_lines(m, instance, config, flex),
     mass=mass,
   )
 
 
-def _claimed(model: int, m: mjstruct.Struct, instance: int, name: str, config: Config) -> int:
+def _claimed(m: mjstruct.Struct, instance: int, name: str, config: Config) -> int:
   """Returns the flex that an organ names as its window and nobody else does."""
   names = flexes.names(m)
-  surface = _surfaces(model, m, instance, without=instance)
+  surface = _surfaces(m, instance, without=instance)
   what = f"organ {name!r}: window {config.window!r}"
   found = flexes.resolve(config.window, name, names)
   if found is None:
@@ -192,27 +190,26 @@ def _tools(m: mjstruct.Struct, name: str, config: Config, flex: int) -> list[int
   return [g for g in meets if bodyid[g] in wanted]
 
 
-def _lines(model: int, m: mjstruct.Struct, instance: int, config: Config, flex: int) -> np.ndarray:
+def _lines(m: mjstruct.Struct, instance: int, config: Config, flex: int) -> np.ndarray:
   """Returns the first vertex of each edge that a window follows, of threads that it may touch."""
   kind, meets, start = m.flex_contype, m.flex_conaffinity, m.flex_vertadr
   moves = m.body_dofnum[m.flex_vertbodyid] > 0
   found = []
-  for thread in _threads(model, m, instance):
+  for thread in _threads(m, instance):
     if not config.follow and (kind[thread] & meets[flex] or kind[flex] & meets[thread]):
       first = start[thread] + np.arange(flexes.vertices(m, thread) - 1)
       found.append(first[moves[first] | moves[first + 1]])
   return np.concatenate([np.zeros(0, np.int64), *found])
 
 
-def _threads(model: int, m: mjstruct.Struct, instance: int) -> list[int]:
+def _threads(m: mjstruct.Struct, instance: int) -> list[int]:
   """Returns the flexes that are threads of the plugin that has an instance."""
   mine = np.flatnonzero(m.plugin == m.plugin[instance]).tolist()
-  return [declare.flex_of(m, k) for k in mine if declare.is_rod(model, k)]
+  return [declare.flex_of(m, k) for k in mine if declare.is_rod(m, k)]
 
 
 def _check_neighbours(
   m: mjstruct.Struct,
-  model: int,
   instance: int,
   name: str,
   windows: Windows,
@@ -225,8 +222,8 @@ def _check_neighbours(
   Windows follow geoms and edges of threads: they would not be there.
   """
   contype, conaffinity, own = m.flex_contype, m.flex_conaffinity, windows.flex
-  surface = _surfaces(model, m, instance, without=instance)
-  bearing = _bearing(model, m, name)
+  surface = _surfaces(m, instance, without=instance)
+  bearing = _bearing(m, name)
   points = origin + rest @ frame.T
   room = _NEAR * float(np.linalg.norm(np.ptp(points, axis=0)))
   low, high = points.min(axis=0) - room, points.max(axis=0) + room
@@ -246,13 +243,13 @@ def _check_neighbours(
       )
 
 
-def _bearing(model: int, m: mjstruct.Struct, name: str) -> set[str]:
+def _bearing(m: mjstruct.Struct, name: str) -> set[str]:
   """Returns the organs on which one rests, and those that rest on it."""
   names = flexes.names(m)
   found = {}
   for other in range(m.nplugin):
     for flex in _rigid_flexes(m, other)[1]:
-      support = mjstruct.config(model, other, "support").split()
+      support = mjstruct.config(m, other, "support").split()
       found[names[flex]] = {flexes.resolve(each, names[flex], names) for each in support}
   return {each for each in names if name in found.get(each, ()) or each in found.get(name, ())}
 
@@ -265,10 +262,10 @@ def touching(model: int, instance: int) -> np.ndarray:
   rigid, start, body = m.flex_rigid, m.flex_vertadr, m.flex_vertbodyid
   own = [np.isin(body[start[f] : start[f] + flexes.vertices(m, f)], ours) for f in range(m.nflex)]
   nodal = [f for f in range(m.nflex) if not rigid[f] and own[f].any()]
-  return np.array([*nodal, *_surfaces(model, m, instance)], int)
+  return np.array([*nodal, *_surfaces(m, instance)], int)
 
 
-def _surfaces(model: int, m: mjstruct.Struct, instance: int, without: int = -1) -> dict[int, int]:
+def _surfaces(m: mjstruct.Struct, instance: int, without: int = -1) -> dict[int, int]:
   """Returns the flex of the organ that each window is of, of all organs or without one."""
   names = flexes.names(m)
   plugin = m.plugin
@@ -276,7 +273,7 @@ def _surfaces(model: int, m: mjstruct.Struct, instance: int, without: int = -1) 
   for other in range(m.nplugin):
     if other != without and plugin[other] == plugin[instance]:
       for flex in _rigid_flexes(m, other)[1]:
-        window = mjstruct.config(model, other, "window").strip()
+        window = mjstruct.config(m, other, "window").strip()
         resolved = flexes.resolve(window, names[flex], names)
         if resolved in names:
           found[names.index(resolved)] = flex
