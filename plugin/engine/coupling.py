@@ -20,7 +20,7 @@ import warp as wp
 from palpate.tissue import types
 from palpate.tissue.body import Body
 from palpate.tissue.kernels import Kernel, kernel
-from palpate.tissue.types import DIMS, Array, floats, lent, scalar, struct, vector
+from palpate.tissue.types import DIMS, Array, State, System, also, lent, struct
 
 from . import layout
 from .layout import NodalState, WindowState
@@ -151,21 +151,10 @@ class Mujoco:
 
 
 @struct
+@also(State, "step", "disp", "vel", "mass", "force_ext", "dvel_warm", "dvel", "expected")
+@also(System, "rhs", "sol", "status", "ratio")
 class Crossing:
   """What of a body's `State` and `System` a coupling reads and writes, for one world."""
-
-  step: floats("nworld", 4)
-  disp: vector
-  vel: vector
-  mass: scalar
-  force_ext: vector
-  dvel_warm: vector
-  dvel: vector
-  rhs: vector
-  sol: vector
-  status: floats("nworld", 4)
-  expected: floats("nworld")
-  ratio: floats("nworld")
 
 
 CONSTANTS = {

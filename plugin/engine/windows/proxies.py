@@ -8,7 +8,7 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.kernels import Kernel, aim
-from palpate.tissue.types import doubles, fill, flags, floats, ints, longs, struct
+from palpate.tissue.types import also, doubles, fill, flags, floats, ints, longs, struct
 
 from .. import coupling
 from ..coupling import Mujoco
@@ -95,22 +95,14 @@ place, gather, scatter, leave, choose, foresee = coupling.kernels(
 
 
 @struct
+@also(Slots, "nvert", "radius", "rest", "touch", "node_mass", "free", "elem", "begin", "following")
 class Reshaping:
   """The slots' vertices, and the mesh that they are to take over."""
 
-  nvert: int
   nelem: int
   most: int  # neighbours that a vertex has room for
   nchanged: int
-  radius: wp.float64  # see `Slots`
   wall: wp.float64  # mass of pinned nodes [kg]
-  rest: doubles("nvert", 3)  # see `Slots`, these and what follows
-  touch: doubles("nvert")
-  node_mass: doubles("nvert")
-  free: ints("nvert")
-  elem: ints("nroom", 3)
-  begin: ints("nvert")
-  following: ints("nroom")
   vert: longs("nchanged")  # vertices that something has changed at
   mesh_rest: doubles("nvert", 3)  # see `Mesh`
   mesh_elem: longs("nelem", 3)
