@@ -331,8 +331,7 @@ class Organ:
     may be in and out again between two looks: one that was stays named until the organ is reset. A
     warning names what comes through while the organ runs; an open surface has no inside.
     """
-    m = mjstruct.Model.from_address(self.model._address)
-    d = mjstruct.Data.from_address(self.data._address)
+    m, d = mjstruct.both(self.model._address, self.data._address)
     tools = penetration.Tools(m, self._organ, penetration.tools(m, self._organ))
     found = {*tools.inside(d, self._deformation), *self._space.report.watch.crossed}
     return tuple(self.model.geom(geom).name or f"geom {geom}" for geom in sorted(found))

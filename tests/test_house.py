@@ -130,9 +130,9 @@ def model_writers() -> set[str]:
       targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
       for target in targets:
         text = ast.unparse(target) if isinstance(target, ast.Subscript) else ""
-        if re.match(r"(mjstruct\.)?view\((m|model)\.|(m|model)\.\w+\[", text):
-          if "tree_sleep_policy" not in text:  # of the windows' bodies, in a step
-            found.add(name_of(path))
+        # Those of the windows' bodies, in a step, and what only renderers read are known.
+        if re.match(r"(m|model)\.(?!tree_sleep_policy|skin_vert)\w+\[", text):
+          found.add(name_of(path))
   return found - {"plugin/engine/model/prepare.py"}
 
 

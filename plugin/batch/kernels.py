@@ -3,7 +3,8 @@
 from typing import Any
 
 import warp as wp
-from palpate.tissue.types import Array, doubles, floats, ints, struct
+from palpate.forces.cohesive_bonds import Bonded
+from palpate.tissue.types import Array, also, doubles, floats, ints, struct
 
 from .mjw.arrays import theirs
 from .organ.patch import Patch
@@ -357,18 +358,11 @@ for _number in NUMBERS:
 
 
 @struct
+@also(Bonded, "row", "count", "made", "slot", "area", "state", "pull", "stretch")
 class BondLists:
-  """Bonds that were made together, in all worlds: fields of `cohesive_bonds.Bonded`."""
+  """Bonds that were made together, in all worlds."""
 
   before: int  # number of bonds in groups before this one
-  row: ints("nworld")
-  count: ints("nrow", 1)
-  made: ints("nrow", "nbond")
-  slot: ints("nrow", "nbond")
-  area: doubles("nrow", "nbond")
-  state: doubles("nworld", "nfree", 2)
-  pull: doubles("nworld", "nbond", 3)
-  stretch: doubles("nworld", "nbond", 3)
   whole: floats("nmade")  # area of each that was made [m^2]
 
 

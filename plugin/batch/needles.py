@@ -49,7 +49,7 @@ class Telling:
   told: ToldNeedles
 
 
-_tell = kernel("tell_needles", "forces/needles.h", Telling, CONSTANTS, tag=".worlds")
+_tell = kernel("tell_needles", "forces/needles.h", Telling, CONSTANTS, tag=".worlds", own=True)
 
 
 class Shown:

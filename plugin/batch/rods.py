@@ -131,7 +131,7 @@ class Thread(thread.Thread):
       massadr=np.where(organ.free[:, None], (bare.M_rowadr + bare.M_rownnz - 1)[dofs], -1),
       own_dof=own_dof,
       dof_tree=bare.dof_treeid,
-      **rods.vertices(lambda name: getattr(bare, name)),
+      **rods.vertices(bare),
       geom_tree=bare.body_treeid[bare.geom_bodyid],
       qpos0=bare.qpos0,
       now=np.tile(organ.rest, (nworld, 1, 1)),

@@ -151,8 +151,7 @@ def strip(
     made.flex_vert[start : start + made.flex_vertnum[flex]] = 0.0
     made.flex_centered[flex] = True
   if made.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
-    m = mjstruct.Model.from_address(model._address)
-    tissues = [contacts.tissue_of(m, organ) for organ in organs]
+    tissues = [contacts.tissue_of(model, organ) for organ in organs]
     sticks = [1 / tissue[TISSUE.stuck] for tissue in tissues if tissue[TISSUE.firm]]
     made.opt.impratio = max(made.opt.impratio, *sticks, 0)
   if made.nv <= 60 and made.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON:
@@ -162,7 +161,7 @@ def strip(
     assert flex == mujoco.mj_name2id(made, mujoco.mjtObj.mjOBJ_FLEX, thread.name)
     start = made.flex_vertadr[flex]
     body = made.flex_vertbodyid[start : start + made.flex_vertnum[flex]]
-    prepare.fit_thread(mjstruct.Model.from_address(made._address), flex, body[thread.free])
+    prepare.fit_thread(made, flex, body[thread.free])
   slots = []
   for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
     first = made.body(f"{organ.name}_slot_0").id

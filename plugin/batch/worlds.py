@@ -71,7 +71,6 @@ class Worlds(Batch):
       engine.find_thread(self.scratch._address, number)
       for number in instances(model, dim=1).values()
     ]
-    host.check(spaces.values())
     if sewn and model.opt.solver != mujoco.mjtSolver.mjSOL_NEWTON:
       kind = mujoco.mjtSolver(model.opt.solver).name.removeprefix("mjSOL_")
       raise ValueError(

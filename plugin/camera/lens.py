@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.tissue.types import Array, floats, ints, struct
+from palpate.tissue.types import Array, also, struct
 
-from .view import Pictures
+from .view import Pictures, View
 
 SMOKE = 0.75  # its grey
 DROPS = 16  # of blood, at most
@@ -23,17 +23,14 @@ _OUTSIDE = wp.constant(-1e6)
 
 
 @struct
+@also(View, "chosen", "fovy", "seed", "far")
 class Lens:
   """Pictures of rows as a scene sends them, and as they are seen."""
 
-  chosen: Array(wp.bool, ("nrow",))  # whether a picture is seen
-  fovy: floats("nrow")  # [rad]
   film: Array(wp.vec3, ("nrow",))  # share of smoke, exposure, deviation of noise
   bend: Array(wp.vec2, ("nrow",))  # k1, k2 of Brown and Conrady
   shake: Array(wp.vec2, ("nrow",))  # way during an exposure, right and down [heights]
   drop: Array(wp.vec3, ("nrow", DROPS))  # middle, right and down of the picture's; radius [heights]
-  seed: ints("nrow")  # of the noise
-  far: float  # depth where nothing is [m]
   sent: Pictures  # by the scene
   seen: Pictures
 

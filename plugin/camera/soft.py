@@ -118,8 +118,7 @@ class Surface:
   def _add_flex(self, model: mujoco.MjModel, scene: Scene):
     """Adds the organ's own surface."""
     mesh, flex = self._mesh, self._organ.flex
-    m = mjstruct.Model.from_address(model._address)
-    self._own = elem = mesh.elem if mesh.spare else flexes.elements(m, flex)
+    self._own = elem = mesh.elem if mesh.spare else flexes.elements(model, flex)
     material, start = int(model.flex_matid[flex]), int(model.flex_texcoordadr[flex])
     thing = scene.thing(_OBJ.mjOBJ_FLEX, flex, material)
     coord = np.zeros((*elem.shape, 2))
@@ -142,7 +141,7 @@ class Surface:
 
   def _open(self, model: mujoco.MjModel, scene: Scene) -> int:
     """Makes room for what cuts open; returns the number of its thing, -1 for none."""
-    m, organ = mjstruct.Model.from_address(model._address), self._organ
+    m, organ = mjstruct.model(model._address), self._organ
     walls = organ.config.walls
     flex = flexes.find(m, "flex", walls, organ.name) if walls else -1
     if flex < 0:

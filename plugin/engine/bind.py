@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def bind(w: Workspace, model: int):
   """Points the graphs at the arrays of `model` and of the workspace's mjData and records them."""
-  m = mjstruct.Model.from_address(model)
+  m = mjstruct.model(model)
   device, cpu = w.body.device, wp.get_device("cpu")
   scheme = step.SCHEMES[w.config.integrator]
   with graphs.lock:
@@ -107,12 +107,12 @@ def _advance(w: Workspace, does: Phases, ends: bool):
 
 def _watch(w: Workspace, model: int):
   """Notes what of a model a step looks at, and what it was."""
-  m = mjstruct.Model.from_address(model)
+  m = mjstruct.model(model)
   organ = w.organ
   if organ.windows:
-    tree = mjstruct.view(m.body_treeid, m.nbody, np.int32)[organ.windows.body[0]]
-    w.seen.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[tree:].data
-    w.seen.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :].data
+    tree = m.body_treeid[organ.windows.body[0]]
+    w.seen.policy = m.tree_sleep_policy[tree:].data
+    w.seen.counts = m.flex_vertnum[organ.flex :].data
   w.seen.identity = mjstruct.Identity(model)
   option = model + mjstruct.Model.opt.offset
   w.seen.model_step = mjstruct.view(option + type(m.opt).timestep.offset, 1).data
@@ -124,8 +124,8 @@ def _watch(w: Workspace, model: int):
 def _before(w: Workspace, model: int):
   """Returns what launches a step's work before the solve."""
   touched = _touched(w, model)
-  m = mjstruct.Model.from_address(model)
-  tools = penetration.speeds(m, model, w.data, w.organ, np.asarray(w.report.flags))
+  m = mjstruct.model(model)
+  tools = penetration.speeds(m, w.data, w.organ, np.asarray(w.report.flags))
 
   def launch():
     contacts.launch(touched)

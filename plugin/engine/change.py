@@ -194,7 +194,7 @@ def _change(w: Workspace, model: int, config: Config):
     if material:
       workspace.refresh(w)
     else:
-      workspace.feel(w, mjstruct.Model.from_address(model))
+      workspace.feel(w, mjstruct.model(model))
   if config.foundation != before.foundation and config.carrier:
     others = [group for group in w.attachments.groups if group.by != "carrier"]
     hold(w, model, [*declare_attachments.carried(w.host), *others])

@@ -154,16 +154,15 @@ def make(model: int, data: int, flexes, flags: np.ndarray | memoryview | None = 
     flexes: the flexes whose contacts get their weights
     flags: where to report, see FLAG
   """
-  mine = np.zeros(mjstruct.Model.from_address(model).nflex, np.int32)
+  m = mjstruct.model(model)
+  mine = np.zeros(m.nflex, np.int32)
   mine[flexes] = 1
   out = coupling.mujoco_arrays(model, data, Weights)
-  out.nv = mjstruct.Model.from_address(model).nv
+  out.nv, out.ngeom, out.nflex = m.nv, m.ngeom, m.nflex
   out.wrong = are_wrong()
   tissue, adr = _tissues(model, data)
   out.tissue = wp.array(tissue, dtype=wp.float64, device="cpu", copy=False)
   out.force_adr = wp.array(adr, dtype=int, device="cpu", copy=False)
-  out.ngeom = mjstruct.Model.from_address(model).ngeom
-  out.nflex = mjstruct.Model.from_address(model).nflex
   out.lifted = wp.array(lifted(model, data).ravel(), dtype=int, device="cpu", copy=False)
   out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
   out.mine = wp.array(mine, dtype=int, device="cpu")
@@ -177,7 +176,7 @@ def lifted(model: int, data: int) -> np.ndarray:
 
   Geoms are 0 or 1, and of each flex that is a thread come the first edge and that after the last.
   """
-  m = mjstruct.Model.from_address(model)
+  m = mjstruct.model(model)
   if data not in _lifted or _lifted[data].shape != (m.nflex, m.ngeom + 2 * m.nflex):
     _lifted[data] = np.zeros((m.nflex, m.ngeom + 2 * m.nflex), np.int32)
   return _lifted[data]
@@ -185,7 +184,7 @@ def lifted(model: int, data: int) -> np.ndarray:
 
 def _tissues(model: int, data: int) -> tuple[np.ndarray, np.ndarray]:
   """Returns what the organs of an mjData tell of its flexes and their vertices."""
-  m = mjstruct.Model.from_address(model)
+  m = mjstruct.model(model)
   found = _tissue.get(data)
   if found is None or (len(found[0]), len(found[1])) != (m.nflex, m.nflexvert):
     found = np.zeros((m.nflex, len(TISSUE))), np.full(m.nflexvert, -1, np.int32)
@@ -195,11 +194,11 @@ def _tissues(model: int, data: int) -> tuple[np.ndarray, np.ndarray]:
 
 def tell(w: "Workspace", model: int):
   """Tells contacts with an organ what its tissue is like, and where its contact forces are."""
-  m, organ = mjstruct.Model.from_address(model), w.organ
+  m, organ = mjstruct.model(model), w.organ
   found, adr = _tissues(model, w.data)
-  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[w.seen.instance])
+  start = int(m.plugin_stateadr[w.seen.instance])
   start += coupling.spans(organ)["force"].start
-  first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  first = m.flex_vertadr
   if organ.windows:
     slot = np.arange(organ.windows.nslot)
     adr[first[organ.windows.flex] + slot] = start + 3 * slot
@@ -267,9 +266,7 @@ def tissue_of(m, organ: "Declaration", config: Config | None = None, mass=1.0) -
 
 def says(m, flex: int) -> bool:
   """Returns whether an organ says itself how firm the contacts of a flex are."""
-  solref = mjstruct.view(m.flex_solref, (m.nflex, 2))[flex]
-  solimp = mjstruct.view(m.flex_solimp, (m.nflex, 5))[flex]
-  given, usual = [*solref, *solimp], [*SOLREF, *SOLIMP, 0.5, 2]
+  given, usual = [*m.flex_solref[flex], *m.flex_solimp[flex]], [*SOLREF, *SOLIMP, 0.5, 2]
   return not (np.allclose(given, _USUAL, atol=1e-9) or np.allclose(given, usual, atol=1e-9))
 
 

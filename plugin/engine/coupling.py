@@ -20,7 +20,7 @@ import warp as wp
 from palpate.tissue import types
 from palpate.tissue.body import Body
 from palpate.tissue.kernels import Kernel, kernel
-from palpate.tissue.types import DIMS, Array, floats, lent, scalar, struct, vector
+from palpate.tissue.types import DIMS, Array, State, System, also, lent, struct
 
 from . import layout
 from .layout import NodalState, WindowState
@@ -151,21 +151,10 @@ class Mujoco:
 
 
 @struct
+@also(State, "step", "disp", "vel", "mass", "force_ext", "dvel_warm", "dvel", "expected")
+@also(System, "rhs", "sol", "status", "ratio")
 class Crossing:
   """What of a body's `State` and `System` a coupling reads and writes, for one world."""
-
-  step: floats("nworld", 4)
-  disp: vector
-  vel: vector
-  mass: scalar
-  force_ext: vector
-  dvel_warm: vector
-  dvel: vector
-  rhs: vector
-  sol: vector
-  status: floats("nworld", 4)
-  expected: floats("nworld")
-  ratio: floats("nworld")
 
 
 CONSTANTS = {
@@ -179,9 +168,9 @@ CONSTANTS = {
 }  # fmt: skip
 
 
-def kernels(header: str, kind: Any, *names: str) -> list[Kernel]:
-  """Returns the kernels of a header that take a struct."""
-  return [kernel(name, header, kind, CONSTANTS) for name in names]
+def kernels(header: str, kind: Any, *names: str, own: bool = False) -> list[Kernel]:
+  """Returns the kernels of a header that take a struct, `own` as `kernel` does."""
+  return [kernel(name, header, kind, CONSTANTS, own=own) for name in names]
 
 
 def wrap(address: int, shape: Any, dtype: type = wp.float64) -> wp.array:
@@ -290,8 +279,7 @@ def crossing(arrays: dict[str, wp.array]):
 
 def mass_addresses(m: mjstruct.Struct, dofs: np.ndarray) -> np.ndarray:
   """Returns where the diagonal of each dof lies in mjData.M, the inertia that MuJoCo uses."""
-  rowadr = mjstruct.view(m.M_rowadr, m.nv, np.int32)[dofs]
-  return rowadr + mjstruct.view(m.M_rownnz, m.nv, np.int32)[dofs] - 1
+  return m.M_rowadr[dofs] + m.M_rownnz[dofs] - 1
 
 
 def outer(organ: "Declaration") -> int:
@@ -356,6 +344,6 @@ def check_state(organ: "Declaration", state: np.ndarray):
 
 def plugin_state(model: int, data: int, instance: int, size: int) -> wp.array:
   """Returns an organ's part of mjData.plugin_state."""
-  m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
-  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
-  return wrap(d.plugin_state + 8 * start, size)
+  m, d = mjstruct.both(model, data)
+  start = int(m.plugin_stateadr[instance])
+  return wrap(d.raw.plugin_state + 8 * start, size)

@@ -131,9 +131,8 @@ class Host(host.Host):
 
   def tools(self, name: str) -> np.ndarray:
     """See `Host`."""
-    m, d = self.m, mjstruct.Data.from_address(self.data)
-    shape = {"ctrl": (m.nu,), "geom_xpos": (m.ngeom, 3), "geom_xmat": (m.ngeom, 3, 3)}[name]
-    return mjstruct.view(getattr(d, name), (1, *shape))
+    found = getattr(self.d, name)[None]
+    return found.reshape(1, -1, 3, 3) if name == "geom_xmat" else found
 
   def need_springs(self):
     """See `Host`."""
@@ -186,11 +185,15 @@ class Host(host.Host):
 
   # What there is now.
 
+  @property
+  def d(self) -> mjstruct.Struct:
+    """The mjData."""
+    return mjstruct.both(self.model, self.data)[1]
+
   def body_frame(self, body: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns rotation (3, 3) and place [m] (3,) of a body now."""
-    m, d = self.m, mjstruct.Data.from_address(self.data)
-    turn = mjstruct.view(d.xmat, (m.nbody, 3, 3))[body]
-    return turn, mjstruct.view(d.xpos, (m.nbody, 3))[body]
+    d = self.d
+    return d.xmat[body].reshape(3, 3), d.xpos[body]
 
   def places(self, vert: np.ndarray, now: bool = True) -> np.ndarray:
     """Returns where vertices are in the world, now or at rest [m], (n, 3)."""
@@ -200,8 +203,7 @@ class Host(host.Host):
     if organ.windows:
       u = self.own.motion.disp.numpy()[vert]
     else:
-      m, d = self.m, mjstruct.Data.from_address(self.data)
       qpos = np.maximum(organ.qposadr[vert], 0)[:, None] + np.arange(3)
-      u = mjstruct.view(d.qpos, m.nq)[qpos] - mjstruct.view(m.qpos0, m.nq)[qpos]
+      u = self.d.qpos[qpos] - self.m.qpos0[qpos]
       u = (organ.dofadr[vert] >= 0)[:, None] * u
     return organ.origin + (self._from()[vert] + u) @ organ.frame.T

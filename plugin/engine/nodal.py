@@ -10,7 +10,7 @@ from palpate.tissue.types import doubles, fill, ints, struct
 from . import coupling
 from .coupling import Crossing, Mujoco, Share
 from .layout import FLAG, NodalState
-from .model import inertia, mjstruct
+from .model import inertia
 
 if TYPE_CHECKING:
   from .host import Host
@@ -120,20 +120,14 @@ class Phases(coupling.Phases):
     n.inertia.numpy()[node] = self._share(found)
     n.shift.numpy()[node] = organ.mesh.rest - organ.mesh.whole.rest
 
-  def _views(self) -> tuple[np.ndarray, np.ndarray]:
-    """Returns MuJoCo's qpos and qvel."""
-    m, d = self._host.m, mjstruct.Data.from_address(self._host.data)
-    return mjstruct.view(d.qpos, m.nq), mjstruct.view(d.qvel, m.nv)
-
   def motion(self) -> tuple[np.ndarray, np.ndarray]:
     """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
-    organ, (qpos, qvel) = self._host.organ, self._views()
-    qpos0 = mjstruct.view(self._host.m.qpos0, len(qpos))
+    organ, d, qpos0 = self._host.organ, self._host.d, self._host.m.qpos0
     shift = organ.mesh.rest - organ.mesh.whole.rest
     disp, vel = np.zeros((organ.mesh.nvert, 3)), np.zeros((organ.mesh.nvert, 3))
     at, dofs = organ.qposs.reshape(-1, 3), organ.dofs.reshape(-1, 3)
-    disp[organ.jointed] = qpos[at] - qpos0[at] - shift[organ.jointed]
-    vel[organ.jointed] = qvel[dofs]
+    disp[organ.jointed] = d.qpos[at] - qpos0[at] - shift[organ.jointed]
+    vel[organ.jointed] = d.qvel[dofs]
     own = self._nodal.own
     for values, inside in ((disp, own.disp), (vel, own.vel)):
       values[organ.inner] = inside.numpy().reshape(-1, 3)
@@ -147,18 +141,17 @@ class Phases(coupling.Phases):
 
   def put(self, vert: np.ndarray, disp: np.ndarray | None, vel: np.ndarray | None):
     """See `coupling.Phases`."""
-    organ, (qpos, qvel), own = self._host.organ, self._views(), self._nodal.own
-    qpos0 = mjstruct.view(self._host.m.qpos0, len(qpos))
+    organ, d, own = self._host.organ, self._host.d, self._nodal.own
     shift = organ.mesh.rest - organ.mesh.whole.rest
     vert = vert[organ.free[vert]]
     jointed = organ.dofadr[vert] >= 0
     mine, within = vert[jointed], vert[~jointed]
     if disp is not None:
       at = organ.qposadr[mine, None] + np.arange(3)
-      qpos[at] = qpos0[at] + shift[mine] + disp[mine]
+      d.qpos[at] = self._host.m.qpos0[at] + shift[mine] + disp[mine]
       own.disp.numpy().reshape(-1, 3)[within - organ.mesh.nskin] = disp[within]
     if vel is not None:
-      qvel[organ.dofadr[mine, None] + np.arange(3)] = vel[mine]
+      d.qvel[organ.dofadr[mine, None] + np.arange(3)] = vel[mine]
       own.vel.numpy().reshape(-1, 3)[within - organ.mesh.nskin] = vel[within]
 
   def divide(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):

@@ -89,12 +89,11 @@ def tools(m: mjstruct.Struct, organ: "Declaration") -> np.ndarray:
   """Returns the geoms that move and meet an organ; none where it is open and has no inside."""
   if not organ.mesh.closed:
     return np.zeros(0, int)
-  body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
-  weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)
+  body = m.geom_bodyid
   meets = np.unique(np.concatenate([flexes.meeting_geoms(m, flex) for flex in organ.flexes]))
   needles = [flexes.find(m, "body", row.name, organ.name) for row in organ.config.needles]
   # Needles go through it by right.
-  return meets[(weld[body[meets]] != 0) & ~np.isin(body[meets], needles)]
+  return meets[(m.body_weldid[body[meets]] != 0) & ~np.isin(body[meets], needles)]
 
 
 @coupling.memory("geom_bodyid", "body_rootid", "geom_xpos", "cvel", "subtree_com")
@@ -121,7 +120,7 @@ class Tools:
 
   def __init__(self, m: mjstruct.Struct, organ: "Declaration", geoms: np.ndarray):
     """Takes the geoms of an mjModel."""
-    self.geoms, self.organ, self._ngeom = geoms, organ, m.ngeom
+    self.geoms, self.organ = geoms, organ
     found = points(m, geoms)
     self.reach = _reach(found)
     # Of each point: the tool, and where it is in its frame [m].
@@ -160,17 +159,15 @@ class Tools:
 
   def _poses(self, d: mjstruct.Struct) -> tuple[np.ndarray, np.ndarray]:
     """Returns the tools' places [m], (ntool, 3), and rotations, (ntool, 3, 3)."""
-    pos = mjstruct.view(d.geom_xpos, (self._ngeom, 3))[self.geoms]
-    return pos, mjstruct.view(d.geom_xmat, (self._ngeom, 3, 3))[self.geoms]
+    return d.geom_xpos[self.geoms], d.geom_xmat.reshape(-1, 3, 3)[self.geoms]
 
   def _motion(
     self, m: mjstruct.Struct, d: mjstruct.Struct, pos: np.ndarray
   ) -> tuple[np.ndarray, np.ndarray]:
     """Returns angular velocity [rad/s] and velocity [m/s], (ntool, 3) both."""
-    body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[self.geoms]
-    root = mjstruct.view(m.body_rootid, m.nbody, np.int32)[body]
-    spin, vel = np.moveaxis(mjstruct.view(d.cvel, (m.nbody, 2, 3))[body], 1, 0)
-    com = mjstruct.view(d.subtree_com, (m.nbody, 3))[root]
+    body = m.geom_bodyid[self.geoms]
+    spin, vel = np.moveaxis(d.cvel.reshape(-1, 2, 3)[body], 1, 0)
+    com = d.subtree_com[m.body_rootid[body]]
     return spin, vel + np.cross(spin, pos - com)
 
 
@@ -181,9 +178,9 @@ def points(m: mjstruct.Struct, geoms: np.ndarray) -> list[np.ndarray]:
   MuJoCo feels capsules and boxes at their ends and at the vertices that they meet, so that edges
   pass between.
   """
-  kind = mjstruct.view(m.geom_type, m.ngeom, np.int32)[geoms]
+  kind = m.geom_type[geoms]
   out = []
-  for k, size in zip(kind, mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms], strict=True):
+  for k, size in zip(kind, m.geom_size[geoms], strict=True):
     thick, half = 1.0, np.zeros(3)
     if k in _LONG:
       thick, half[2] = size[0], size[1]
@@ -201,12 +198,10 @@ def _reach(found: list[np.ndarray]) -> np.ndarray:
   return np.array([np.linalg.norm(each, axis=1).max() for each in found])
 
 
-def speeds(
-  m: mjstruct.Struct, model: int, data: int, organ: "Declaration", flags: np.ndarray
-) -> Speeds:
+def speeds(m: mjstruct.Struct, data: int, organ: "Declaration", flags: np.ndarray) -> Speeds:
   """Returns `Speeds` of the tools of an organ."""
   geoms = tools(m, organ)
-  out = coupling.mujoco_arrays(model, data, Speeds)
+  out = coupling.mujoco_arrays(m.address, data, Speeds)
   out.ntool = len(geoms)
   out.tool = wp.array(geoms, dtype=int, device="cpu")
   out.reach = wp.array(_reach(points(m, geoms)), dtype=wp.float64, device="cpu")
@@ -241,7 +236,7 @@ class Watch:
 
     Each once; not those that were inside when this began to look.
     """
-    m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
+    m, d = mjstruct.both(w.model, w.data)
     if self._tools is None or self._tools.organ is not w.organ:
       self._tools = Tools(m, w.organ, tools(m, w.organ))
     seen = self._tools

@@ -11,7 +11,6 @@ import sys
 from typing import Any
 
 import mujoco
-import numpy as np
 from palpate.tissue.config import KEYS
 
 from ..forces.passive import Force
@@ -123,7 +122,7 @@ def _nstate(model: int, instance: int) -> int:
 @signals.watch
 def _init(model: int, data: int, instance: int) -> int:
   try:
-    made = rods if declare.is_rod(model, instance) else workspace
+    made = rods if declare.is_rod(mjstruct.model(model), instance) else workspace
     w = made.make(model, data, instance)
     _workspaces[data, instance] = _states[w.plugin_state.ctypes.data] = w
     if isinstance(w, Workspace):
@@ -164,8 +163,8 @@ def _twin(data: int, force: Force) -> tuple[Workspace, Force]:
 
 @signals.watch
 def _reset(model: int, state: int, unused: int | None, instance: int):
-  m = mjstruct.Model.from_address(model)
-  size = int(mjstruct.view(m.plugin_statenum, m.nplugin, np.int32)[instance])
+  m = mjstruct.model(model)
+  size = int(m.plugin_statenum[instance])
   mjstruct.view(state, size)[:] = 0
   w = _states.get(state)  # mjData.plugin_data, the other argument, is copied by pickle
   if w is not None:
@@ -325,8 +324,8 @@ def _watch(w: Workspace):
       "3 or a greater young may keep them from it, a reset puts them right"
     )
   for geom in w.report.watch.look(w):
-    m = mjstruct.Model.from_address(w.model)
-    name = mjstruct.name_of(m, m.name_geomadr, geom) or geom
+    m = mjstruct.model(w.model)
+    name = mjstruct.name_of(m, "geom", geom) or geom
     warn(
       f"organ {w.organ.name!r}: geom {name!r} has gone through its surface, where contacts do not "
       "hold it any more; see Organ.pierced"

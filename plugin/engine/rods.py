@@ -7,7 +7,6 @@ coupling (`coupling/rod.h`) of its own, in doubles on the CPU.
 import dataclasses
 import functools
 import zlib
-from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -111,7 +110,7 @@ class Rod:
   below: ints("nunknown")  # scratch
   status: ints(1)  # iterations; -1: not finite; more than `newton`: not solved
   count: ints(4)  # rows of constraints that act on the rod; pairs of edges listed; entries; nodes
-    # that stand for bodies
+  # that stand for bodies
   smooth: doubles(1)  # velocity below which friction is viscous in this step [m/s]
   reach: doubles(1)  # how far these may be apart before they touch [m]
   listed: doubles("nnode", 3)  # place where these were listed [m]
@@ -122,7 +121,7 @@ class Rod:
   row_node: ints("nrow")  # the first of the two nodes
   row_efc: ints("nrow")  # its number in MuJoCo
   row_tree: ints("nrow")  # tree of bodies that it reaches, -1 for none, -3 if these do not yield,
-    # -4 for vertices of an organ
+  # -4 for vertices of an organ
   row_yields: ints("nrow", 4)  # nodes that stand for what yields, then -1
   stands: ints("nplace")  # first dof of the vertex of an organ that a node stands for, or -1
   row_body: doubles("nrow", 12)  # J of these
@@ -226,14 +225,13 @@ class Declaration:
     return ~(self.free[1:] | self.free[:-1])
 
 
-def read(model: int, instance: int) -> Declaration:
+def read(m: mjstruct.Struct, instance: int) -> Declaration:
   """Returns the thread that plugin instance `instance` of an mjModel declares.
 
   Raises:
     ValueError: the declaration is not one this plugin can run.
   """
   devices.init()
-  m = mjstruct.Model.from_address(model)
   flex = declare.flex_of(m, instance)
   name = flexes.name(m, flex)
   _check(m, flex, name)
@@ -244,20 +242,18 @@ def read(model: int, instance: int) -> Declaration:
       f"thread {name!r}: its {len(edge)} edges do not join its {len(rest)} vertices in order, "
       "expected edges 0 1, 1 2, ... of two vertices or more"
     )
-  radius = float(mjstruct.view(m.flex_radius, m.nflex)[flex])
+  radius = float(m.flex_radius[flex])
   length = np.linalg.norm(np.diff(rest, axis=0), axis=1)
   rod.check_edges(name, length, radius)
   rod.check_apart(name, rest, radius, NEIGHBOURS * radius, 2 * CORE * radius)
-  texts = declare.keys(model, instance)
+  texts = declare.keys(m, instance)
   try:
     config = configuration.parse(name, texts, len(edge), closed=False)
   except ValueError as error:
     raise ValueError(str(error).replace("organ ", "thread ", 1)) from None
   rod.check_refine(name, config, length, radius, ~(free[1:] | free[:-1]))
   dofadr, qposadr = declare.addresses(m, name, body, free)
-  kind, aims, dim = (
-    mjstruct.array(m, name) for name in ("flex_contype", "flex_conaffinity", "flex_dim")
-  )
+  kind, aims, dim = m.flex_contype, m.flex_conaffinity, m.flex_dim
   meets = (kind[flex] & aims | kind & aims[flex]) * (dim > 1)
   most = _MOST_VERTICES if meets.any() else 0
   return Declaration(
@@ -286,17 +282,13 @@ def settings(organ: Declaration, friction: float) -> dict:
   )
 
 
-def vertices(array: Callable[[str], np.ndarray]) -> dict[str, np.ndarray]:
-  """Returns the fields of `Bound` that say which dofs are of vertices of organs.
-
-  Args:
-    array: returns an array of the model by its name
-  """
-  of, vertex = array("dof_bodyid"), array("flex_vertbodyid")
-  count = np.diff(np.append(array("flex_vertadr"), len(vertex)))  # those that wait for cuts too
-  vertex = vertex[np.repeat(array("flex_dim"), count) > 1]
-  vertex = vertex[array("body_dofnum")[vertex] == 3]
-  return {"dof_first": array("body_dofadr")[of], "dof_vertex": np.where(np.isin(of, vertex), of, 0)}
+def vertices(m) -> dict[str, np.ndarray]:
+  """Returns the fields of `Bound` that say which dofs of a model are of vertices of organs."""
+  of, vertex = m.dof_bodyid, m.flex_vertbodyid
+  count = np.diff(np.append(m.flex_vertadr, len(vertex)))  # those that wait for cuts too
+  vertex = vertex[np.repeat(m.flex_dim, count) > 1]
+  vertex = vertex[m.body_dofnum[vertex] == 3]
+  return {"dof_first": m.body_dofadr[of], "dof_vertex": np.where(np.isin(of, vertex), of, 0)}
 
 
 def scratch(organ: Declaration, nv: int) -> dict[str, np.ndarray]:
@@ -317,14 +309,14 @@ def state_of(state: np.ndarray, organ: Declaration, nv: int) -> Views:
 
 def _check(m, flex: int, name: str):
   """Raises ValueError where a flex cannot be a thread."""
-  dim = mjstruct.view(m.flex_dim, m.nflex, np.int32)[flex]
+  dim = m.flex_dim[flex]
   if dim != 1:
     raise ValueError(
       f"organ {name!r}: elements is 'rod' and flexcomp dim is {dim}, expected dim='1' (a line)"
     )
   declare.check_integrator(m, name)
   declare.check_flex(m, flex, name)
-  if mjstruct.view(m.flex_selfcollide, m.nflex, np.int32)[flex]:
+  if m.flex_selfcollide[flex]:
     raise ValueError(
       f"thread {name!r}: selfcollide is set, expected 'none': the plugin handles a thread's "
       "contacts with itself"
@@ -358,7 +350,7 @@ class Workspace:
   def bind(self, model: int):
     """Takes the arrays of an mjModel and of the mjData, and records the launches."""
     self._model = model
-    m, organ = mjstruct.Model.from_address(model), self.organ
+    m, organ = mjstruct.model(model), self.organ
     dofs = np.maximum(organ.dofadr, 0)[:, None] + np.arange(3)
     sizes = organ.sizes(m.nv)
     size = layout.size(RodState, sizes)
@@ -366,9 +358,9 @@ class Workspace:
     found = coupling.mujoco_arrays(model, self.data, Bound)
     own_dof = np.full(m.nv, -1)
     own_dof[organ.dofs] = (3 * np.flatnonzero(organ.free)[:, None] + np.arange(3)).ravel()
-    mass = mjstruct.view(m.body_mass, m.nbody)[organ.body]
+    mass = m.body_mass[organ.body]
     self.mass = mass = np.where(organ.free, mass, mass[organ.free].mean())
-    self.friction = float(mjstruct.view(m.flex_friction, (m.nflex, 3))[organ.flex, 0])
+    self.friction = float(m.flex_friction[organ.flex, 0])
     self.constants = self._constants(organ.length)
     self.own = layout.carve(RodState, self.state, sizes)
     values = self.constants | settings(organ, self.friction) | {"mass": mass, "body": mass}
@@ -387,11 +379,9 @@ class Workspace:
       bodyid=organ.body,
       massadr=np.where(organ.free[:, None], coupling.mass_addresses(m, dofs), -1),
       own_dof=own_dof,
-      dof_tree=mjstruct.view(m.dof_treeid, m.nv, np.int32),
-      **vertices(functools.partial(mjstruct.array, m)),
-      geom_tree=mjstruct.view(m.body_treeid, m.nbody, np.int32)[
-        mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
-      ],
+      dof_tree=m.dof_treeid,
+      **vertices(m),
+      geom_tree=m.body_treeid[m.geom_bodyid],
       frame=organ.frame,
       mj=coupling.mujoco_arrays(model, self.data),
       nv=m.nv,
@@ -405,7 +395,7 @@ class Workspace:
         each.load(cpu)
       self._begin, self._end = begin.command(self.fields), end.command(self.fields)
     self._status = own.status.numpy().data
-    self._passive = mjstruct.view(mjstruct.Data.from_address(self.data).qfrc_passive, m.nv)
+    self._passive = mjstruct.both(model, self.data)[1].qfrc_passive
     self._dofs = organ.dofs
     self.seen.signature = self.own.signature.numpy().data
     self.seen.identity = mjstruct.Identity(model)
@@ -487,7 +477,8 @@ class Workspace:
 
 def make(model: int, data: int, instance: int) -> Workspace:
   """Returns a thread in a fresh mjData; makes the model fit it."""
+  m = mjstruct.model(model)
   with graphs.lock:
-    organ = read(model, instance)
-    prepare.fit_thread(mjstruct.Model.from_address(model), organ.flex, organ.body[organ.free])
+    organ = read(m, instance)
+    prepare.fit_thread(m, organ.flex, organ.body[organ.free])
     return Workspace(organ, model, data, instance)

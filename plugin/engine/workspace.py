@@ -297,7 +297,7 @@ class Workspace:
       raise ValueError(declare.NO_RK4)
     for place, was in self.seen.static:
       if place.tobytes() != was:
-        declare.check_frame(mjstruct.Model.from_address(self.model), self.organ)
+        declare.check_frame(mjstruct.model(self.model), self.organ)
 
   def _is_astray(self, turn: Turn) -> bool:
     """Returns whether qpos was set without the plugin state: slots are not on their nodes."""
@@ -392,7 +392,7 @@ class Workspace:
     """Returns the inertia that contacts meet at each vertex [kg], (nvert,)."""
     if self.organ.windows:
       return self.views["inertia"].numpy().copy()
-    return inertia.of_dofs(mjstruct.Model.from_address(model), self.organ)
+    return inertia.of_dofs(mjstruct.model(model), self.organ)
 
   def note(self, text: str):
     """Keeps the first error and says it."""
@@ -442,16 +442,16 @@ def attach(w: Workspace, model: int):
 
 def make(model: int, data: int, instance: int) -> Workspace:
   """Returns the workspace of an organ in a fresh mjData; makes the model fit the organ."""
-  has_windows = bool(mjstruct.config(model, instance, "window"))
+  m = mjstruct.model(model)
+  has_windows = bool(mjstruct.config(m, instance, "window"))
   with graphs.lock:
-    organ = (declare_windows if has_windows else declare).read(model, instance)
-    m = mjstruct.Model.from_address(model)
+    organ = (declare_windows if has_windows else declare).read(m, instance)
     body = bodies.worlds(organ.still)
     host = Host(organ, body, data, model, instance)
     w = Workspace(host, Seen(instance), Report(host.flags().numpy().data))
     if organ.windows:
       w.turn = Turn()
-    _view(w, mjstruct.Data.from_address(data))
+    _view(w)
     prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
     mass = np.where(body.shape.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
@@ -470,7 +470,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     return w
 
 
-def _view(w: Workspace, d: mjstruct.Struct):
+def _view(w: Workspace):
   """Takes views of an mjData that every step looks at."""
   fields = mjstruct.Data
   w.seen.status = w.host.arrays["status"].numpy()[0].data
@@ -478,7 +478,7 @@ def _view(w: Workspace, d: mjstruct.Struct):
   w.seen.nefc = mjstruct.view(w.data + fields.nefc.offset, 1, np.int32).data
   if w.turn is not None:
     first, last = int(w.organ.qposs.min()), int(w.organ.qposs.max()) + 1
-    w.turn.qpos = mjstruct.view(d.qpos + 8 * first, 8 * (last - first), np.uint8).data
+    w.turn.qpos = w.host.d.qpos[first:last].view(np.uint8).data
 
 
 def join(spaces: list[Workspace]) -> list[Workspace]:
@@ -523,7 +523,7 @@ def sync(w: Workspace):
 
 def refresh(w: Workspace):
   """Renews the effective inertia after the time step or the material changed; see `inertia`."""
-  m = mjstruct.Model.from_address(w.model)
+  m = mjstruct.model(w.model)
   with graphs.lock:
     if w.organ.windows is None:
       prepare.give_armature(m, w.declared, w.body, w.config)

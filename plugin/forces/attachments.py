@@ -14,7 +14,6 @@ from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import doubles, ints, struct, vector
 
-from ..engine.model import mjstruct
 from .host import Bodies, Host, Input, Lists, Nodes, kernels, numbers
 from .passive import Force, Springs
 from .transfer import Grip, Held, pairs
@@ -131,7 +130,7 @@ def _held_share(mesh: Mesh, vert: np.ndarray, pins: tuple[int, ...]) -> np.ndarr
 class Attachments(Force):
   """The attachments of an organ, none at first."""
 
-  KEYS, WORLDS = ("attach", "carrier"), True
+  KEYS = ("attach", "carrier")
   ENTER, ACT = _enter, _act
 
   def __init__(self, host: Host):
@@ -229,7 +228,7 @@ class Attachments(Force):
     weight = float(m.opt.timestep) * (float(m.opt.timestep) + host.config.damping) * stiffness
     if body == TO_OWN_MOTION:
       return weight < _LEADS * host.organ.mass.sum()
-    return body > 0 and weight * mjstruct.view(m.body_invweight0, (m.nbody, 2))[body, 0] < _LEADS
+    return body > 0 and weight * m.body_invweight0[body, 0] < _LEADS
 
   @property
   def aims(self) -> bool:

@@ -149,7 +149,7 @@ class Bonds(Force):
     currents: what weakens them after each step, see `burn`
   """
 
-  KEYS, WORLDS = ("bonds",), True
+  KEYS = ("bonds",)
   ENTER = _enter
 
   def __init__(self, host: Host):

@@ -100,7 +100,7 @@ class Cutters(Force):
     geoms: fields of `Blades` that say which they are
   """
 
-  KEYS, WORLDS = ("cutters",), True
+  KEYS = ("cutters",)
   ACT, END = _act, _keep
 
   def __init__(self, host: Host):
@@ -129,7 +129,7 @@ class Cutters(Force):
     n = len(found)
     geom, half, axis = np.full((n, 2), -1), np.zeros((n, 2)), np.zeros((n, 2), int)
     self._width = np.zeros(n)
-    skin = float(mjstruct.view(m.flex_radius, m.nflex)[host.organ.flexes[0]])
+    skin = float(m.flex_radius[host.organ.flexes[0]])
     for i, geoms in enumerate(found):
       for k, g in enumerate(geoms):
         geom[i, k] = g
@@ -163,7 +163,7 @@ class Cutters(Force):
       stiff = force * (edge if solid else 1.0) / (_SLACK * edge)
       for g in self.geoms["geom"][i]:
         if g >= 0:
-          body = int(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[g])
+          body = int(m.geom_bodyid[g])
           stiff = min(stiff, most(host, body))
       rows.append((force, row.energy * self._width[i], stiff, thickness, solid))
     return np.array(rows)
@@ -185,13 +185,17 @@ class Cutters(Force):
     host, n = self.host, len(self.names)
     values: dict[str, Any] = {name: host.zeros(n, width) for name, width in _WIDTHS.items()}
     law = self._law(host.config.thickness)
-    values |= self.geoms | host.surface() | dict(
-      nblade=n,
-      edge=float(host.organ.mesh.whole.edge_length),
-      law=np.tile(law, (host.nworld, 1, 1)),
-      state=host.rows("blade", len(BLADE)),
-      held=host.zeros(n, _HELD, dtype=int),
-      due=host.zeros(n, dtype=int),
+    values |= (
+      self.geoms
+      | host.surface()
+      | dict(
+        nblade=n,
+        edge=float(host.organ.mesh.whole.edge_length),
+        law=np.tile(law, (host.nworld, 1, 1)),
+        state=host.rows("blade", len(BLADE)),
+        held=host.zeros(n, _HELD, dtype=int),
+        due=host.zeros(n, dtype=int),
+      )
     )
     self.fields = host.fill(Blades, values, into=self.fields)
     self._due = self.fields.due.numpy()[0].data if host.alone else None
@@ -298,7 +302,7 @@ class Cutters(Force):
 
 
 def _name(m, geom: int) -> str:
-  return mjstruct.name_of(m, m.name_geomadr, geom)
+  return mjstruct.name_of(m, "geom", geom)
 
 
 def _find(host: Host, name: str, current: bool) -> int:
@@ -320,8 +324,8 @@ def _find(host: Host, name: str, current: bool) -> int:
 def _shape(host: Host, geom: int) -> tuple[int, float, float]:
   """Returns the axis of a geom along which its edge is, half its length and its width [m]."""
   m = host.m
-  kind = int(mjstruct.view(m.geom_type, m.ngeom, np.int32)[geom])
-  size = mjstruct.view(m.geom_size, (m.ngeom, 3))[geom]
+  kind = int(m.geom_type[geom])
+  size = m.geom_size[geom]
   if kind == _BOX:
     order = np.argsort(size)
     return int(order[2]), float(size[order[2]]), 2 * float(size[order[1]])

@@ -145,16 +145,15 @@ def _firm(host: Host) -> np.ndarray:
 def most(host: base.Host, body: int) -> float:
   """Returns the most that springs to a body may have together [N/m]."""
   m = host.m
-  if _is_mocap(m, body) or not mjstruct.view(m.body_weldid, m.nbody, np.int32)[body]:
+  if _is_mocap(m, body) or not m.body_weldid[body]:
     return np.inf
-  weight = mjstruct.view(m.body_invweight0, (m.nbody, 2))[body, 0]
+  weight = m.body_invweight0[body, 0]
   return _LIGHT / (_gain(host) * max(weight, 1e-12))
 
 
 def _is_mocap(m: mjstruct.Struct, body: int) -> bool:
   """Returns whether a body or one above it is a mocap body."""
-  mocap = mjstruct.view(m.body_mocapid, m.nbody, np.int32)
-  parent = mjstruct.view(m.body_parentid, m.nbody, np.int32)
+  mocap, parent = m.body_mocapid, m.body_parentid
   while body > 0:
     if mocap[body] >= 0:
       return True

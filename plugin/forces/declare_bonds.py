@@ -150,15 +150,15 @@ def _normals(host: Host, now: bool) -> np.ndarray:
 
 def _far_from_geoms(m: mjstruct.Struct, body: int, points: np.ndarray) -> np.ndarray:
   """Returns the distance of points to a body's geoms, in its frame [m], (n,)."""
-  geoms = np.flatnonzero(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32) == body)
+  geoms = np.flatnonzero(m.geom_bodyid == body)
   geom = np.zeros((len(geoms), len(GEOM)))
-  box = mjstruct.view(m.geom_aabb, (m.ngeom, 2, 3))[geoms]
-  quat = mjstruct.view(m.geom_quat, (m.ngeom, 4))[geoms]
+  box = m.geom_aabb.reshape(-1, 2, 3)[geoms]
+  quat = m.geom_quat[geoms]
   for name, values in (
-    ("pos", mjstruct.view(m.geom_pos, (m.ngeom, 3))[geoms]),
+    ("pos", m.geom_pos[geoms]),
     ("axis", np.array([flexes.matrix(q).T.ravel() for q in quat]).reshape(-1, 9)),
-    ("type", mjstruct.view(m.geom_type, m.ngeom, np.int32)[geoms, None]),
-    ("size", mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms]),
+    ("type", m.geom_type[geoms, None]),
+    ("size", m.geom_size[geoms]),
     ("box", box[:, 0]),
     ("half", box[:, 1]),
     ("bound2", np.full((len(geoms), 1), np.inf)),

@@ -17,29 +17,26 @@ _BESIDE = 1.4  # how much farther than they reach a thread's contacts end before
 
 def is_free(m, body: int) -> bool:
   """Returns whether a body has a free joint."""
-  joint = mjstruct.view(m.body_jntadr, m.nbody, np.int32)[body]
-  kind = mjstruct.view(m.jnt_type, m.njnt, np.int32)
-  return joint >= 0 and kind[joint] == int(mujoco.mjtJoint.mjJNT_FREE)
+  joint = m.body_jntadr[body]
+  return joint >= 0 and m.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_FREE)
 
 
 def read(host: Host, name: str) -> dict[str, Any]:
   """Returns the arc, the tip and the geoms of a needle."""
   m, organ = host.m, host.organ
   body = flexes.need(m, "body", name, organ.name, "needles")
-  mine = np.flatnonzero(mjstruct.view(m.site_bodyid, m.nsite, np.int32) == body)
-  sites = {mjstruct.name_of(m, m.name_siteadr, int(site)): site for site in mine}
+  mine = np.flatnonzero(m.site_bodyid == body)
+  sites = {mjstruct.name_of(m, "site", int(site)): site for site in mine}
   ends = [next((sites[s] for s in sites if s.endswith(f"_{end}")), None) for end in _ENDS]
-  geoms = np.flatnonzero(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32) == body)
-  at = mjstruct.view(m.site_pos, (m.nsite, 3))
+  geoms = np.flatnonzero(m.geom_bodyid == body)
   if None in ends or not len(geoms):
     raise ValueError(
       f"organ {organ.name!r}: needles names {name!r}, which has no geoms or no sites '_swage' and "
       "'_tip', expected a body that `palpate.add_needle` has made"
     )
-  tip = at[ends[1]]
+  tip = m.site_pos[ends[1]]
   circle, half = float(np.hypot(*tip[:2])), float(np.arctan2(tip[1], tip[0]))
-  size = mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms]
-  middle = mjstruct.view(m.geom_pos, (m.ngeom, 3))[geoms]
+  size, middle = m.geom_size[geoms], m.geom_pos[geoms]
   place = (np.arctan2(middle[:, 1], middle[:, 0]) + half) * circle
   edge = organ.mesh.whole.edge_length
   if edge > circle:
@@ -55,7 +52,7 @@ def read(host: Host, name: str) -> dict[str, Any]:
   return {
     "body": body, "circle": circle, "half": half, "radius": float(size[:, 0].max()),
     "strand": strand(host, body),
-    "slit": 2 * float(mjstruct.view(m.site_size, (m.nsite, 3))[ends[1], 0]),
+    "slit": 2 * float(m.site_size[ends[1], 0]),
     "parts": list(zip(geoms.tolist(), (place + size[:, 1]).tolist(), strict=True)),
   }  # fmt: skip
 
@@ -72,55 +69,45 @@ def strand(host: Host, needle: int) -> dict[str, Any]:
   m, none = host.m, np.zeros((0, 3))
   out = {"flex": -1, "node": none[:, 0], "local": none, "edges": none[:, :2], "refine": False,
          "friction": 0.0, "close": 0.0, "bead": 0.0, "thick": 0.0}  # fmt: skip
-  first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
-  size = mjstruct.view(m.geom_size, (m.ngeom, 3))[:, 0]
-  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
+  first, body = m.flex_vertadr, m.flex_vertbodyid
   joined = {
     int(pair[1 - side])
-    for pair, kind in zip(_pairs(m), mjstruct.view(m.eq_type, m.neq, np.int32), strict=True)
+    for *pair, kind in zip(m.eq_obj1id, m.eq_obj2id, m.eq_type, strict=True)
     for side in range(2)
     if pair[side] == needle and kind == int(mujoco.mjtEq.mjEQ_CONNECT)
   }
-  for flex in np.flatnonzero(mjstruct.view(m.flex_dim, m.nflex, np.int32) == 1).tolist():
+  for flex in np.flatnonzero(m.flex_dim == 1).tolist():
     if int(body[first[flex]]) not in joined:
       continue
     mine = slice(int(first[flex]), int(first[flex]) + flexes.vertices(m, flex))
-    instance = int(mjstruct.view(m.body_plugin, m.nbody, np.int32)[body[mine][0]])
-    texts = declare.keys(host.model, instance)
+    instance = int(m.body_plugin[body[mine][0]])
+    texts = declare.keys(host.m, instance)
     where = declare.places(m, instance, flex, flexes.name(m, flex))
     rest, frame, origin = where[1], where[3], where[4]
     length = np.linalg.norm(np.diff(rest, axis=0), axis=1)
     config = configuration.parse(flexes.name(m, flex), texts, len(length), closed=False)
-    thick = float(mjstruct.view(m.flex_radius, m.nflex)[flex])
+    thick = float(m.flex_radius[flex])
     section = np.pi * thick**2
     edges = np.stack([length, np.asarray(config.young) * section / length], axis=1)
     out = {
       "flex": flex,
       "node": body[mine].copy(),
-      "local": mjstruct.view(m.flex_vert, (m.nflexvert, 3))[mine].copy(),
+      "local": m.flex_vert[mine].copy(),
       "edges": np.concatenate([edges, edges[-1:]]),
       "refine": config.refine > 0,
       "frame": frame,
       "origin": origin,
       "close": _BESIDE * (radius(host) + thick),
       "thick": 2.0 * thick,
-      "bead": float(
-        size[mjstruct.view(m.geom_bodyid, m.ngeom, np.int32) == body[mine][-1]].max(initial=0.0)
-      ),
-      "friction": float(mjstruct.view(m.flex_friction, (m.nflex, 3))[flex, 0]),
+      "bead": float(m.geom_size[m.geom_bodyid == body[mine][-1], 0].max(initial=0.0)),
+      "friction": float(m.flex_friction[flex, 0]),
     }
   return out
 
 
 def radius(host: Host) -> float:
   """Returns the radius of the flex that touches an organ's needles [m]."""
-  return float(mjstruct.view(host.m.flex_radius, host.m.nflex)[host.organ.flexes[-1]])
-
-
-def _pairs(m) -> np.ndarray:
-  """Returns the two objects of each equality, (neq, 2)."""
-  ids = [mjstruct.view(array, m.neq, np.int32) for array in (m.eq_obj1id, m.eq_obj2id)]
-  return np.stack(ids, axis=1)
+  return float(host.m.flex_radius[host.organ.flexes[-1]])
 
 
 def crossings(line: np.ndarray, x: np.ndarray) -> list[tuple[float, int, float, float, bool]]:

@@ -2,8 +2,7 @@
 
 The plugin's host has one world, in MuJoCo's own memory (`palpate.engine.host`); that of a batch has
 rows of worlds, in mujoco_warp's (`palpate.batch.organ.host`). A force is written once, over structs
-whose arrays have worlds in front: a kernel begins by moving what worlds have of their own to its
-world.
+whose arrays have worlds in front, and a kernel gets the rows of its world.
 """
 
 import abc
@@ -105,8 +104,8 @@ def kernels(header: str, kind: Any, *names: str) -> list[Twin]:
   """Returns the kernels of a header that take a struct, for both hosts."""
   return [
     Twin(
-      kernel(name, header, kind, CONSTANTS),
-      kernel(name, header, for_worlds(kind), CONSTANTS, tag=".worlds"),
+      kernel(name, header, kind, CONSTANTS, own=True),
+      kernel(name, header, for_worlds(kind), CONSTANTS, tag=".worlds", own=True),
     )
     for name in names
   ]
@@ -236,7 +235,7 @@ class Host(abc.ABC):
   @property
   def m(self) -> Any:
     """The compiled mjModel's struct."""
-    return mjstruct.Model.from_address(self.model)
+    return mjstruct.model(self.model)
 
   @property
   def nnode(self) -> int:
@@ -246,7 +245,7 @@ class Host(abc.ABC):
   def may_move(self, body: int | np.ndarray) -> bool:
     """Returns whether one of these bodies may move: all but what is welded to the world."""
     m = self.m
-    return bool(mjstruct.view(m.body_weldid, m.nbody, np.int32)[body].any())
+    return bool(m.body_weldid[body].any())
 
   def zeros(self, *shape: int, dtype: Any = wp.float64) -> wp.array:
     """Returns an array with worlds in front."""

@@ -4,11 +4,12 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from palpate.tissue import body as bodies
 from palpate.tissue.geometry import faces
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
-from palpate.tissue.types import doubles, floats, ints, struct
+from palpate.tissue.types import State, also, doubles, ints, struct
 
 from .host import Bodies, Host, Input, Lists, Nodes, kernels
 from .passive import Force
@@ -20,6 +21,7 @@ _SMOOTH = 3  # times that normals are averaged
 
 
 @struct
+@also(State, *bodies.PAIRS)
 class Lipped:
   """Pairs of vertices that were one before a cut, each vertex in one of them."""
 
@@ -32,9 +34,6 @@ class Lipped:
   corner: ints("nrow", "npair", 2, 3)  # vertices of a triangle at each
   normal: doubles("nrow", "npair", 2, 3)  # from the first to the second in the triangles' axes
   stiffness: doubles("nrow", "npair")  # [N/m]
-  paired: ints("nworld")  # see `State`
-  pair_node: ints("nworld", "npairslice", 8)
-  pair_hold: floats("nworld", "npairslice", 6, 8)
   own: Nodes
   solve: Input
   mj: Bodies
@@ -46,7 +45,7 @@ class Lipped:
 class Lips(Force):
   """The lips of an organ's cuts."""
 
-  KEYS, WORLDS, ENTER = ("spare",), True, _enter
+  KEYS, ENTER = ("spare",), _enter
 
   def __init__(self, host: Host):
     super().__init__(host)

@@ -57,7 +57,7 @@ class Pierced:
   strand_flex: ints("nneedle")  # the thread's flex
   node: ints("nnode")  # body of a thread's node, from the swage on
   local: doubles("nnode", 3)  # place of the node there [m]
-  edges: doubles("nmade", "nnode", 2)  # rest length [m] and stiffness [N/m] of the next edge
+  edges: doubles("*", "nnode", 2)  # rest length [m] and stiffness [N/m] of the next edge
   ngeom: int  # geoms of the model
   lifted: ints("nworld", "nlift")  # what does not touch the organ, see `contacts.lifted`
   mesh: ints("nworld")  # which mesh a world has
@@ -159,7 +159,7 @@ class Needles(Force):
     names: of the needles' bodies
   """
 
-  KEYS, WORLDS = ("needles",), True
+  KEYS = ("needles",)
   ENTER, ACT, END = _enter, _act, _keep
 
   def __init__(self, host: Host):
@@ -211,7 +211,7 @@ class Needles(Force):
     thick = np.array([each["radius"] for each in found])
     length = 2 * self._shape["half"] * self._shape["circle"]
     self._margin = np.maximum(_MARGIN * (radius + thick), _POINT * length)
-    self.names = [mjstruct.name_of(m, m.name_bodyadr, int(b)) for b in body]
+    self.names = [mjstruct.name_of(m, "body", int(b)) for b in body]
     host.need_springs()
 
   def take(self, declared: "Needles", twin: Any):

@@ -59,7 +59,6 @@ class Force:
 
   Attributes:
     KEYS: configuration keys that ask for it
-    WORLDS: whether its kernels are over rows of worlds; a batch on a GPU refuses what is not
     ENTER, ACT, END: kernels of `enter`, `act` and `end`, None for nothing
     host: the organ
     fields: what they take, made by `bind`
@@ -68,7 +67,6 @@ class Force:
   """
 
   KEYS: ClassVar[tuple[str, ...]]
-  WORLDS: ClassVar[bool] = False
   ENTER: ClassVar[Twin | None] = None
   ACT: ClassVar[Twin | None] = None
   END: ClassVar[Twin | None] = None

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
-from palpate.tissue.types import blank, doubles, floats, ints, scalar, struct, vector
+from palpate.tissue.types import State, System, also, blank, doubles, ints, struct
 
 from ..engine.layout import FLAG
 from .host import Bodies, Host, edited, kernels
@@ -11,6 +11,8 @@ from .passive import Force
 
 
 @struct
+@also(State, *bodies.PAIRS, "hold", "mass", "force_ext", "dvel")
+@also(System, "sol", "rhs", "status")
 class Relaxing:
   """The nodes of an organ whose stress relaxes, the moving ones."""
 
@@ -21,16 +23,6 @@ class Relaxing:
   law: doubles(2)  # share that relaxes [-], time constant [s]
   flags: ints(len(FLAG))  # see FLAG
   quiet: doubles("nworld")  # how long it has been at rest [s]
-  hold: floats("nworld", "nholdslice", 6, 8)
-  paired: ints("nworld")  # see `State`
-  pair_node: ints("nworld", "npairslice", 8)
-  pair_hold: floats("nworld", "npairslice", 6, 8)
-  mass: scalar
-  force_ext: vector
-  dvel: vector
-  sol: vector
-  rhs: vector
-  status: floats("nworld", 4)
   mj: Bodies
 
 
@@ -40,7 +32,7 @@ _enter, _end = kernels("forces/relaxation.h", Relaxing, "enter_relaxation", "end
 class Relaxation(Force):
   """Stress relaxation of an organ."""
 
-  KEYS, WORLDS = ("relax_share",), True
+  KEYS = ("relax_share",)
   ENTER, END = _enter, _end
 
   def __init__(self, host: Host):

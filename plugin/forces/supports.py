@@ -87,7 +87,7 @@ class Supports(Force):
     below: supports of the organs that it rests on
   """
 
-  KEYS, WORLDS = ("support",), True
+  KEYS = ("support",)
   ENTER, END = _press, _keep
 
   def __init__(self, host: Host):
@@ -128,12 +128,12 @@ class Supports(Force):
       self._arrays["on"].fill_(-1)
     on: list[Supports | None] = [None, *self.below]
     self._beds += [self._bed(other) for other in on[len(self._beds) :]]
-    friction = mjstruct.view(m.geom_friction, (m.ngeom, 3))[geoms, 0]
-    bodies = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[geoms]
+    friction = m.geom_friction[geoms, 0]
+    bodies = m.geom_bodyid[geoms]
     common = self._arrays | dict(
       ngeom=len(geoms),
       restless=int(bool(self.below) or host.may_move(bodies)),
-      skin=float(mjstruct.view(m.flex_radius, m.nflex)[flex]),
+      skin=float(m.flex_radius[flex]),
       geom=geoms,
       friction=np.maximum(friction, _friction(m, flex)),
       free=organ.free,
@@ -271,4 +271,4 @@ def _warn_twice(organ: str, geom: str):
 
 
 def _friction(m: Any, flex: int) -> float:
-  return float(mjstruct.view(m.flex_friction, (m.nflex, 3))[flex, 0])
+  return float(m.flex_friction[flex, 0])

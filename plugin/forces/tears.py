@@ -35,7 +35,7 @@ class Stretched:
 class Tears(Force):
   """Where an organ tears; false where it does not."""
 
-  KEYS, WORLDS = ("tear",), True
+  KEYS = ("tear",)
 
   def __bool__(self) -> bool:
     return self.host.config.tear > 0 and self.host.organ.mesh.spare > 0

@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .types import DIMS
+
 NATIVE = pathlib.Path(__file__).parents[1] / "native"
 # Warp modules of the kernels by kind of device, in the order in which they were declared, and the
 # constants that any of their kernels knows.
@@ -118,6 +120,7 @@ def kernel(
   bounds: tuple[int, int] | int | None = None,
   tag: str = "",
   fast: bool = False,
+  own: bool = False,
 ) -> Kernel:
   """Returns the kernel that calls palpate::name(fields, thread, arg) for each thread.
 
@@ -132,6 +135,7 @@ def kernel(
     bounds: threads of a block at most, and blocks that a multiprocessor must have room for
     tag: what tells a module from others of the header with other constants
     fast: whether quotients and roots may be off in the last digit on CUDA
+    own: whether the function gets what its world has of its own, see `_lead`
   """
   known = tuple(constants.items())
 
@@ -148,8 +152,9 @@ def kernel(
   native.__name__ = native.__qualname__ = f"{name}_native"
   native.__annotations__["f"] = brought.__annotations__["f"] = struct
   pointed.__annotations__["f"] = wp.array(dtype=struct)
-  call = f"palpate::Flush flush; palpate::{name}(f, palpate::Thread{{world, tid, nthread}}, arg);"
-  native = wp.func_native(call)(native)
+  lead, fields = (f"auto own = f; {_lead(struct, 'own')}", "own") if own else ("", "f")
+  call = f"palpate::{name}({fields}, palpate::Thread{{world, tid, nthread}}, arg);"
+  native = wp.func_native(f"palpate::Flush flush; {lead}{call}")(native)
 
   def made(entry, kind: str, bounds) -> wp.Kernel:
     entry.__name__ = entry.__qualname__ = name
@@ -159,6 +164,33 @@ def kernel(
     return wp.kernel(enable_backward=False, launch_bounds=bounds, module=module)(entry)
 
   return Kernel(struct, made(brought, "cuda", bounds), made(pointed, "cpu", None))
+
+
+# The first sizes of arrays with a row a world, where "*" may be one row of all, and "nlump" none.
+# And what says a world's row of others.
+_WORLDS = "nworld", "*", "nlump"
+_ROW = {"nrow": "row", "nmesh": "mesh"}
+
+
+def _lead(struct, path: str) -> str:
+  """Returns C++ that leads the arrays of a struct, and of structs in it, to their world's rows.
+
+  These are rows of arrays whose first size is in `_WORLDS` or `_ROW`.
+  """
+  arrays: dict[str, list[str]] = {}
+  text = ""
+  for name, var in struct.vars.items():
+    dims = DIMS[struct.key].get(name)
+    if dims:
+      size = "nworld" if dims[0] in _WORLDS else dims[0]
+      arrays.setdefault(size, []).append(f"{path}.{name}")
+    elif isinstance(var.type, type(struct)):
+      text += _lead(var.type, f"{path}.{name}")
+  for size in (*_ROW, "nworld"):  # the world's row is known until it is led there itself
+    row = f"palpate::own_row({path}.{_ROW[size]}, world)" if size in _ROW else "world"
+    if size in arrays:
+      text += f"palpate::move_each({', '.join([row, *arrays[size]])}); "
+  return text
 
 
 @functools.cache

@@ -13,9 +13,9 @@ import warp as wp
 from .geometry.mesh import Mesh
 from .kernels import aim, kernel
 from .order import LANES, addresses, pad
-from .rows import typed
+from .rows import Filling, typed
 from .step import OWN_SHARE
-from .types import CONSTANTS, doubles, flags, halves, ints, longs, struct
+from .types import CONSTANTS, also, doubles, flags, halves, ints, longs, struct
 
 EDGES = 2  # by which cuts may divide edges, for one spare vertex
 _WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
@@ -30,6 +30,8 @@ ADDRESSES = ("slot_adr", "around_adr", "edge_adr")
 
 @struct
 @typed(OF_SHAPE, OF_TISSUE)
+@also(Filling, "nchanged", "nint", "nreal", "skip", "centre", "pinned", "node", "slot_adr")
+@also(Filling, "found", "ints", "reals")
 class Within:
   """A solid, what its rows are made of, and what they are written to, under the names there."""
 
@@ -42,14 +44,9 @@ class Within:
   nedge: int  # before the first cut
   nplace: int  # places of edges
   nwait: int  # the last so many wait for edges that cuts divide
-  nchanged: int
   every: int  # whether all is written, but what a surface has too
   clears: int  # whether blocks of former neighbours are in `half`
-  nint: int  # whole numbers of scratch
-  nreal: int  # others
-  skip: wp.int64  # words by which what is written to lies after the arrays
   own: wp.float64  # share of mu that tetrahedra have by themselves
-  centre: doubles(3)  # that rest positions are about [m]
   mesh_rest: doubles("nvert", 3)  # see `Mesh`, with those that follow
   ring: longs("nvert", "most")
   mesh_degree: longs("nvert")
@@ -62,11 +59,8 @@ class Within:
   mu: doubles("ntet")  # [Pa]
   lam: doubles("ntet")  # [Pa]
   steep: doubles("ntet")  # volume times the square of the steepest gradient [m]
-  pinned: flags("nvert")  # whether a vertex does not move
   changed: ints("ntet")  # tetrahedra that are not as they were
   before: ints("ntet", 4)  # corners that they had
-  node: ints("nvert")
-  slot_adr: ints("nslice + 1")
   around_adr: ints("nslice + 1")
   edge_adr: ints("nedgeslice + 1")
   which: ints("npair")  # the edge of each pair of corners before the first cut
@@ -76,9 +70,6 @@ class Within:
   edge_pair: ints("npair")  # these
   place: ints("nedge")  # where each edge lies
   half: halves("nhalf")  # see `System`
-  found: ints(1)  # whether there was room
-  ints: ints("nint")
-  reals: doubles("nreal")
 
 
 _fill = kernel("fill_solid", "tissue/tets.h", Within, CONSTANTS)

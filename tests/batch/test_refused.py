@@ -12,8 +12,6 @@ import palpate.batch
 import pytest
 import warp as wp
 from devices import needs_cuda
-from palpate.forces.passive import Force
-from palpate.forces.table import FORCES
 from scenes import load, press, probed
 
 DEVICE = "warp-cpu"  # what mujoco_warp gets is the same
@@ -47,15 +45,6 @@ def test_a_tool_that_it_does_not_know():
 def test_what_hangs_on_an_organs_nodes(extra):
   with pytest.raises(ValueError, match="without the organs' nodes"):
     make(press(subdivisions=1).replace("</mujoco>", extra + "</mujoco>"))
-
-
-def test_a_force_that_is_not_over_rows_of_worlds(monkeypatch):
-  class Tide(Force):
-    KEYS = ("tide",)
-
-  monkeypatch.setitem(FORCES, "tide", Tide)  # one that somebody adds, for one world
-  with pytest.raises(ValueError, match="organ 'organ': tide is set, which a batch on a GPU cannot"):
-    make(press(subdivisions=1))
 
 
 def test_a_thread_with_another_solver():

@@ -13,7 +13,6 @@ import numpy as np
 import warp as wp
 from palpate.engine import contacts, coupling
 from palpate.engine.contacts import TISSUE
-from palpate.engine.model import mjstruct
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, also, doubles, floats, ints
 
@@ -29,7 +28,7 @@ _ASKED, _SHARE, _FIRM = (wp.constant(k) for k in (TISSUE.asked, TISSUE.share, TI
 _SMALL = tuple(int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
                for name in ("SPHERE", "CAPSULE", "CYLINDER"))  # fmt: skip
 # What of these fields are those of `Patch`.
-_OF_PATCH = ("nnode", "nslice", "nslot", "ntool", "ngeom", "mesh", "rest", "force", "slot_node",
+_OF_PATCH = ("nnode", "nslice", "nslot", "ntool", "mesh", "rest", "force", "slot_node",
              "tool", "tool_geom", "geom_xpos", "geom_xmat")  # fmt: skip
 
 
@@ -68,9 +67,8 @@ class Pressed:
   pressed: floats("nworld", "many")
 
 
-_find_series = kernel(
-  "find_series", "coupling/world_contacts.h", Pressed, coupling.CONSTANTS | TISSUE.constants()
-)
+_known = coupling.CONSTANTS | TISSUE.constants()
+_find_series = kernel("find_series", "coupling/world_contacts.h", Pressed, _known, own=True)
 
 
 @wp.func
@@ -261,7 +259,7 @@ def make(organ: "Organ", model: mujoco.MjModel, touch):
   out.pairs = 2.0 / float(model.opt.impratio)
   out.disableflags, out.timestep = bare.opt.disableflags, float(bare.opt.timestep)
   out.discrete = int(bare.opt.integrator == getattr(mujoco.mjtIntegrator, "mjINT_DISCRETE", -1))
-  tissue = contacts.tissue_of(mjstruct.Model.from_address(model._address), organ.declared)
+  tissue = contacts.tissue_of(model, organ.declared)
   out.tissue = wp.array(np.tile(tissue, (batch.nworld, 1)), dtype=wp.float64, device=device)
   tools = contacts.LIGHT * model.body_invweight0[model.geom_bodyid, 0]
   out.tools = wp.array(tools, dtype=float, device=device)

@@ -14,7 +14,6 @@ import warp as wp
 
 # All that depends on names inside of mujoco_warp: its tools against a triangle, and types.
 from palpate.engine import contacts
-from palpate.engine.model import mjstruct
 from palpate.tissue.types import Array, fill, floats, ints
 
 from ..kernels import triple
@@ -386,7 +385,7 @@ def make(organ: "Organ", model: mujoco.MjModel, tools: np.ndarray, lines: list):
   ring = 1 if alone else int(np.diff(patch.near_adr.numpy()).max())
   own = organ.declared.flexes[0]
   rows = [_mix(model, "geom", int(g), own) for g in tools]
-  if not contacts.says(mjstruct.Model.from_address(model._address), own):
+  if not contacts.says(model, own):
     firm = {"solref": (contacts.SLOW * model.opt.timestep, 1.0), "solimp": _HARD}
     rows = [row | firm for row in rows]
   number = np.array([len(line.rest) - 1 for line in lines], int)

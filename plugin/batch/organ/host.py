@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 from palpate.engine import coupling
 from palpate.engine.layout import FLAG
-from palpate.engine.workspace import Workspace
 from palpate.forces import host
 from palpate.forces.host import Input, Twin, WorldBodies, WorldNodes
-from palpate.forces.table import FORCES
 from palpate.tissue import body as bodies
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import DIMS, fill
@@ -138,17 +136,6 @@ class Host(host.Host):
       wp.launch(put_back_rows, dim=there.shape, inputs=[mask, start, there], device=device)
     for which in self._which:
       wp.launch(forget, dim=self.nworld, inputs=[mask, which], device=device)
-
-
-def check(spaces: Iterable[Workspace]):
-  """Raises ValueError where workspaces have forces that a batch on a GPU cannot do."""
-  for w in spaces:
-    for kind in FORCES.values():
-      if w.forces.of(kind) and not kind.WORLDS:
-        raise ValueError(
-          f"organ {w.organ.name!r}: {' or '.join(kind.KEYS)} is set, which a batch on a GPU cannot "
-          "do; expected none"
-        )
 
 
 def bodies_of(batch: Worlds) -> Any:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 from palpate.engine import contacts
-from palpate.engine.model import inertia, mjstruct
+from palpate.engine.model import inertia
 from palpate.tissue import body as bodies
 from palpate.tissue import shape
 from palpate.tissue.body import Body
@@ -108,8 +108,7 @@ class Material:
       **{key: own[key][worlds] for key in ("poisson", "thickness")},
       **{key: number[:, NUMBERS.index(key)] for key in ("foundation", "stiffness")},
     )
-    m = mjstruct.Model.from_address(self.batch.model._address)
-    tissue = contacts.tissue_of(m, organ.declared, config, own["mass"][worlds])
+    tissue = contacts.tissue_of(self.batch.model, organ.declared, config, own["mass"][worlds])
     self._put(self._pressed.tissue, worlds, tissue)
 
   def _moduli(self, worlds: np.ndarray) -> dict[str, np.ndarray]:
@@ -183,30 +182,29 @@ class Material:
         f"organ {organ.name!r}: young times thickness is in [{low:g}, {high:g}] times the "
         f"compiled one, expected [{GRADES[0]:g}, {GRADES[-1]:g}]"
       )
-    m = mjstruct.Model.from_address(self.batch.model._address)
-    self._find_inertia(m)
+    self._find_inertia()
     organ.patch.grade.assign(np.log2(scale / own["mass"] / GRADES[0]).astype(np.float32))
     most, nu = scale * self._most, own["poisson"]
     hard = most * (1 + self._squeeze(nu))
     if hard.max() > self._hardest:
       self._hardest, k = hard.max(), int(np.argmax(hard))
-      self._follow(m, *self._scaled(float(most[k]), float(nu[k])))
+      self._follow(*self._scaled(float(most[k]), float(nu[k])))
 
-  def _follow(self, m, body: Body, config: Config):
+  def _follow(self, body: Body, config: Config):
     """Lets the step be one for the stiffest world."""
-    organ = self._organ
+    organ, m = self._organ, self.batch.model
     newton = max(organ.body.newton, inertia.iterations(m, organ.space.organ, config))
     stiff = bool(organ.patch.stiff)
     if not stiff and organ.responds:
-      nodal = organ.space.inertia(self.batch.model._address)
+      nodal = organ.space.inertia(m._address)
       stiff = inertia.stiffness(m, organ.space.organ, body, config, nodal)[0]
     if (newton, stiff) != (organ.body.newton, bool(organ.patch.stiff)):
       organ.body.newton, organ.patch.stiff = newton, int(stiff)
       self.batch.record()
 
-  def _find_inertia(self, m):
+  def _find_inertia(self):
     """Fills the effective inertia at each of GRADES, once."""
-    organ, w = self._organ, self._organ.space
+    organ, w, m = self._organ, self._organ.space, self.batch.model
     if self._graded or not organ.spreads:
       return
     flex = w.organ.windows.flex if w.organ.windows else w.organ.flex

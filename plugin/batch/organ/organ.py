@@ -108,8 +108,6 @@ class Organ(Tissue):
     values |= dict(
       nq=m.nq,
       nv=m.nv,
-      nbody=m.nbody,
-      ngeom=m.ngeom,
       dofadr=place.dofadr,
       qposadr=place.qposadr,
       bodyid=place.body,
@@ -117,7 +115,6 @@ class Organ(Tissue):
       sleeps=int(self.body.plan is not None),
       stiff=int(w.graphs.stiff and self._scheme.respond is not None),
       heaviest=float(w.host.arrays["heaviest"].numpy()[0]),
-      ngravity=nworld,
       overflow=batch.lost,
       bad=batch.bad,
       mask=batch.mask,

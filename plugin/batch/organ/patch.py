@@ -8,7 +8,7 @@ import warp as wp
 from palpate.engine import coupling
 from palpate.engine.coupling import Crossing
 from palpate.engine.layout import GEOM
-from palpate.engine.model import inertia, mjstruct
+from palpate.engine.model import inertia
 from palpate.engine.windows import proxies
 from palpate.tissue import step
 from palpate.tissue.cutting.facets import World
@@ -47,14 +47,11 @@ class Patch:
   nslot: int  # slots
   ntool: int  # geoms that the slots follow, and after them edges of threads
   nline: int  # edges of threads
-  ngeom: int  # geoms of the model
   nq: int
   nv: int
-  nbody: int
   dofadr: int  # first dof of the slots
   qposadr: int  # their first number in qpos
   bodyid: int  # their first body
-  ngravity: int  # rows of `gravity`
   ngrade: int  # rows of `inertia`
   stiff: int  # whether the organ answers for itself, see `inertia.stiffness`
   sleeps: int  # whether it may sleep
@@ -118,6 +115,7 @@ tell_tools, enter, rank, stand, push, take, follow, commit, find_bad, rest = cou
   Patch,
   *("tell_tools", "enter_worlds", "rank", "stand", "push_worlds", "take", "follow"),
   *("commit_worlds", "find_bad", "rest_organ"),
+  own=True,
 )
 
 
@@ -200,7 +198,7 @@ class Surface:
     self._organ = organ
     margins = *model.geom_margin[tools], *(model.flex_margin[line.flex] for line in lines)
     self._reach = _skin(organ, model) + float(max(margins, default=0.0))
-    mass = inertia.masses(mjstruct.Model.from_address(model._address), organ)
+    mass = inertia.masses(model, organ)
     if organ.windows:
       self._held = proxies.hold(organ, mass)
     else:

@@ -86,7 +86,7 @@ class Cuts:
     """Takes views of a model, and of the plugin state."""
     if not self:
       return
-    m, organ = mjstruct.Model.from_address(model), self.declared
+    m, organ = mjstruct.model(model), self.declared
     where = coupling.spans(organ)
     self._own = {name: state[where[name]] for name in BLOCKS}
     self._words = state[where["corner"].start : where["weight"].stop]

@@ -42,7 +42,7 @@ class Walls:
     self._flex, self._shown = -1, True
     if not name:
       return
-    m = mjstruct.Model.from_address(model)
+    m = mjstruct.model(model)
     names = flexes.names(m)
     found = flexes.resolve(name, organ.name, names)
     if found is None:
@@ -61,29 +61,29 @@ class Walls:
   def hide(self, model: int):
     """Hides the flex until the next picture."""
     if self and self._shown:
-      self._show(mjstruct.Model.from_address(model), False)
+      self._show(mjstruct.model(model), False)
 
   def _show(self, m, shown: bool):
     room = len(flexes.element_data(m, self._flex))
     counts = (self._nvert, room, 0) if shown else (0, 0, room)
     for name, count in zip(_COUNTS, (*counts, 0, -1), strict=True):
-      mjstruct.view(getattr(m, name), m.nflex, np.int32)[self._flex] = count
+      getattr(m, name)[self._flex] = count
     self._shown = shown
 
   def draw(self, organ: Declaration, disp: np.ndarray, model: int, data: int):
     """Writes the walls, of vertices displaced by `disp` [m], where renderers read them."""
-    m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
+    m, d = mjstruct.both(model, data)
     elem, mesh = flexes.element_data(m, self._flex), organ.mesh
     skin = mesh.nskin if len(mesh.tet) else 0
-    radius = float(mjstruct.view(m.flex_radius, m.nflex)[organ.flex])
+    radius = float(m.flex_radius[organ.flex])
     x, lips = _lips(mesh, mesh.rest + disp, radius)
     x = np.concatenate([(mesh.rest + disp)[:skin], x])[: self._nvert]
     wall = np.concatenate([mesh.elem[mesh.whole.nelem :], skin + lips])
     wall = wall[(wall < len(x)).all(axis=1)][: len(elem)]
     elem[: len(wall)], elem[len(wall) :] = wall, 0  # without area, which nobody sees
     self._show(m, True)
-    start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[self._flex])
-    out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + len(x)]
+    start = int(m.flex_vertadr[self._flex])
+    out = d.flexvert_xpos[start : start + len(x)]
     out[:] = organ.origin + x @ organ.frame.T
 
 

@@ -161,26 +161,25 @@ class Windows:
     return len(self.body)
 
 
-def read(model: int, instance: int) -> Declaration:
+def read(m: mjstruct.Struct, instance: int) -> Declaration:
   """Returns the organ that plugin instance `instance` of an mjModel declares.
 
   Raises:
     ValueError: the declaration is not one this plugin can run.
   """
   devices.init()
-  m = mjstruct.Model.from_address(model)
   flex = flex_of(m, instance)
   name = flexes.name(m, flex)
   check_surface(m, flex, name)
   check_flex(m, flex, name)
   body, rest, free, frame, origin = places(m, instance, flex, name)
   nvert, parent = len(rest), find_parent(m, name, body, free)
-  config, mesh = read_mesh(m, name, keys(model, instance), rest, flex)
+  config, mesh = read_mesh(m, name, keys(m, instance), rest, flex)
   check_volume(name, mesh, config)
   if config.carrier and not free.all():
     raise ValueError(f"organ {name!r}: carrier is set and vertices are pinned, expected no <pin>")
   dofadr, qposadr = addresses(m, name, body, free)
-  mass = mjstruct.view(m.body_mass, m.nbody)[body]
+  mass = m.body_mass[body]
   if config.elements == "solid":
     mesh = fill_inside(name, mesh, config)
     share = fill.vertex_volumes(mesh)
@@ -219,24 +218,24 @@ def places(
   Raises:
     ValueError: no vertex moves, or they have no parent body that stands still.
   """
-  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex]
+  start = m.flex_vertadr[flex]
   nvert = flexes.vertices(m, flex)
-  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + nvert].copy()
-  local = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + nvert]
+  body = m.flex_vertbodyid[start : start + nvert].copy()
+  local = m.flex_vert[start : start + nvert]
   free = np.isin(body, moving_bodies(m, instance))
   if not free.any():
     raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
   parent = find_parent(m, name, body, free)
   frame, origin = static_frame(m, name, parent)
   turn = find_turn(m, name, body[free])
-  rest = np.where(free[:, None], mjstruct.view(m.body_pos, (m.nbody, 3))[body] @ turn, 0.0)
+  rest = np.where(free[:, None], m.body_pos[body] @ turn, 0.0)
   rest += np.where(free[:, None], local, local @ turn)
   return body, rest, free, frame @ turn, origin
 
 
-def is_rod(model: int, instance: int) -> bool:
+def is_rod(m: mjstruct.Struct, instance: int) -> bool:
   """Returns whether a plugin instance is a thread's, see `rods`."""
-  return mjstruct.config(model, instance, "elements").strip() == "rod"
+  return mjstruct.config(m, instance, "elements").strip() == "rod"
 
 
 def read_mesh(
@@ -298,9 +297,9 @@ def cached(
     return _made[key]
 
 
-def keys(model: int, instance: int) -> dict[str, str]:
+def keys(m: mjstruct.Struct, instance: int) -> dict[str, str]:
   """Returns the configuration keys that are set."""
-  texts = {key: mjstruct.config(model, instance, key) for key in configuration.KEYS}
+  texts = {key: mjstruct.config(m, instance, key) for key in configuration.KEYS}
   return {key: text for key, text in texts.items() if text}
 
 
@@ -309,25 +308,20 @@ def moving_bodies(m, instance: int) -> np.ndarray:
 
   MuJoCo marks the parent body as the plugin's too where vertices are pinned to it.
   """
-  owner = mjstruct.view(m.body_plugin, m.nbody, np.int32)
-  jointed = mjstruct.view(m.body_jntnum, m.nbody, np.int32) > 0
-  bodies = np.flatnonzero((owner == instance) & jointed)
-  return np.setdiff1d(bodies, mjstruct.view(m.body_parentid, m.nbody, np.int32)[bodies])
+  bodies = np.flatnonzero((m.body_plugin == instance) & (m.body_jntnum > 0))
+  return np.setdiff1d(bodies, m.body_parentid[bodies])
 
 
 def flex_of(m, instance: int) -> int:
   """Returns the flex whose vertices a plugin instance owns."""
-  owner = mjstruct.view(m.body_plugin, m.nbody, np.int32)
   bodies = moving_bodies(m, instance)
   if not bodies.size:
-    bodies = np.flatnonzero(owner == instance)
-  vertbody = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
-  vertadr = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
-  vertnum = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)
-  mine = np.isin(vertbody, bodies)
-  found = [f for f in range(m.nflex) if mine[vertadr[f] : vertadr[f] + vertnum[f]].any()]
+    bodies = np.flatnonzero(m.body_plugin == instance)
+  mine = np.isin(m.flex_vertbodyid, bodies)
+  spans = zip(m.flex_vertadr, m.flex_vertnum, strict=True)
+  found = [f for f, (start, count) in enumerate(spans) if mine[start : start + count].any()]
   if not found:
-    who = mjstruct.name_of(m, m.name_bodyadr, int(bodies[0])) if bodies.size else "?"
+    who = mjstruct.name_of(m, "body", int(bodies[0])) if bodies.size else "?"
     raise ValueError(
       f"plugin palpate.organ on body {who!r}: no flex has vertices there, expected the plugin "
       "inside a <flexcomp dim='2'>"
@@ -340,7 +334,7 @@ def flex_of(m, instance: int) -> int:
 
 def check_surface(m, flex: int, name: str):
   """Raises ValueError where a flex cannot be an organ's surface."""
-  dim = mjstruct.view(m.flex_dim, m.nflex, np.int32)[flex]
+  dim = m.flex_dim[flex]
   if dim != 2:
     raise ValueError(f"organ {name!r}: flexcomp dim is {dim}, expected dim='2' (a surface)")
   check_integrator(m, name)
@@ -354,22 +348,20 @@ def check_integrator(m, name: str):
 
 def check_flex(m, flex: int, name: str):
   """Raises ValueError where a flex cannot give MuJoCo's dofs to an organ or a thread."""
-  if mjstruct.view(m.flex_rigid, m.nflex, np.bool_)[flex]:
+  if m.flex_rigid[flex]:
     raise ValueError(
       f"organ {name!r}: flexcomp is rigid (or all its vertices are pinned), expected rigid='false'"
     )
-  if mjstruct.view(m.flex_interp, m.nflex, np.int32)[flex]:
+  if m.flex_interp[flex]:
     raise ValueError(f"organ {name!r}: flexcomp dof is interpolated, expected dof='full'")
-  stiffness = mjstruct.view(m.flex_edgestiffness, m.nflex)[flex]
-  adr = int(mjstruct.view(m.flex_stiffnessadr, m.nflex, np.int32)[flex])
-  native = mjstruct.view(m.flex_stiffness, adr + 1)[adr] if adr >= 0 and m.flex_stiffness else 0.0
-  if stiffness or native:
+  adr = int(m.flex_stiffnessadr[flex])
+  native = m.flex_stiffness[adr] if adr >= 0 and m.flex_stiffness.size else 0.0
+  if m.flex_edgestiffness[flex] or native:
     raise ValueError(
       f"organ {name!r}: flexcomp has MuJoCo elasticity too, expected no <elasticity young='...'> "
       "and no <edge stiffness='...'>; use the plugin's keys"
     )
-  kinds, firsts = (mjstruct.view(a, m.neq, np.int32) for a in (m.eq_type, m.eq_obj1id))
-  if np.any(np.isin(kinds, _EDGES) & (firsts == flex)):
+  if np.any(np.isin(m.eq_type, _EDGES) & (m.eq_obj1id == flex)):
     raise ValueError(
       f"organ {name!r}: an equality of MuJoCo holds the flex's edges, expected none and no "
       "<edge equality='...'>; use the plugin's keys"
@@ -396,14 +388,14 @@ def check_volume(name: str, mesh: Mesh, config: Config):
 
 def find_parent(m, name: str, body: np.ndarray, free: np.ndarray) -> int:
   """Returns the one body that the vertices' bodies hang on."""
-  parents = np.unique(mjstruct.view(m.body_parentid, m.nbody, np.int32)[body[free]])
+  parents = np.unique(m.body_parentid[body[free]])
   if parents.size > 1:
     raise ValueError(
       f"organ {name!r}: its vertices have {parents.size} parent bodies, expected one"
     )
   elsewhere = np.setdiff1d(body[~free], parents)
   if elsewhere.size:
-    who = mjstruct.name_of(m, m.name_bodyadr, int(elsewhere[0]))
+    who = mjstruct.name_of(m, "body", int(elsewhere[0]))
     raise ValueError(
       f"organ {name!r}: a vertex is attached to body {who!r}, expected free vertices or ones "
       "pinned to the parent body"
@@ -416,7 +408,7 @@ def find_turn(m, name: str, body: np.ndarray) -> np.ndarray:
 
   A flexcomp has none, but `attach` turns the bodies of a world that it puts in a frame.
   """
-  quats = mjstruct.view(m.body_quat, (m.nbody, 4))[body]
+  quats = m.body_quat[body]
   if np.abs(quats - quats[0]).max() > 1e-9:
     raise ValueError(f"organ {name!r}: its vertices' bodies are rotated, expected all alike")
   return flexes.matrix(quats[0])
@@ -424,13 +416,11 @@ def find_turn(m, name: str, body: np.ndarray) -> np.ndarray:
 
 def static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:
   """Returns rotation and position of the organ's parent body, which must not move."""
-  parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
-  jntnum = mjstruct.view(m.body_jntnum, m.nbody, np.int32)
-  mocap = mjstruct.view(m.body_mocapid, m.nbody, np.int32)
+  parentid, jntnum, mocap = m.body_parentid, m.body_jntnum, m.body_mocapid
   body = parent
   while body > 0:
     if jntnum[body] or mocap[body] >= 0:
-      who = mjstruct.name_of(m, m.name_bodyadr, body)
+      who = mjstruct.name_of(m, "body", body)
       what = "has joints" if jntnum[body] else "is a mocap body"
       raise ValueError(
         f"organ {name!r}: its parent body {who!r} {what}, expected a static frame (parent bodies "
@@ -442,7 +432,7 @@ def static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:
 
 def static_places(m, organ: Declaration) -> list[memoryview]:
   """Returns position and turn, as bytes, of each body that the organ or a window hangs on."""
-  parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
+  parentid = m.body_parentid
   start = [int(organ.body[0])] if organ.windows else parentid[organ.body[organ.jointed]]
   slots = parentid[organ.windows.body] if organ.windows else []
   found: set[int] = set()
@@ -450,23 +440,24 @@ def static_places(m, organ: Declaration) -> list[memoryview]:
     while body > 0:
       found.add(body)
       body = int(parentid[body])
-  places = (mjstruct.view(m.body_pos, (m.nbody, 3)), mjstruct.view(m.body_quat, (m.nbody, 4)))
   bodies = np.array(sorted(found), int)
   runs = np.split(bodies, np.flatnonzero(np.diff(bodies) > 1) + 1) if len(bodies) else []
   return [
-    each[run[0] : run[-1] + 1].view(np.uint8).reshape(-1).data for run in runs for each in places
+    each[run[0] : run[-1] + 1].view(np.uint8).reshape(-1).data
+    for run in runs
+    for each in (m.body_pos, m.body_quat)
   ]
 
 
 def check_frame(m, organ: Declaration):
   """Raises ValueError where the organ's frame is not, or no longer, where it was declared."""
-  parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
+  parentid = m.body_parentid
   body = int(organ.body[0]) if organ.windows else int(parentid[organ.body[organ.jointed][0]])
   frame, origin = static_frame(m, organ.name, body)
   if not organ.windows:
     frame = frame @ find_turn(m, organ.name, organ.body[organ.jointed])
   if not (np.array_equal(frame, organ.frame) and np.array_equal(origin, organ.origin)):
-    who = mjstruct.name_of(m, m.name_bodyadr, body)
+    who = mjstruct.name_of(m, "body", body)
     raise ValueError(
       f"its parent body {who!r} was moved after its mjData was made, expected a static frame; make "
       "a new MjData"
@@ -475,19 +466,16 @@ def check_frame(m, organ: Declaration):
 
 def addresses(m, name: str, body: np.ndarray, free: np.ndarray):
   """Returns first dof and first qpos of each vertex, -1 where pinned."""
-  jntadr = mjstruct.view(m.body_jntadr, m.nbody, np.int32)[body]
-  jntnum = mjstruct.view(m.body_jntnum, m.nbody, np.int32)[body]
-  first = jntadr[free]
+  first = m.body_jntadr[body[free]]
   joints = np.minimum(first[:, None] + np.arange(3), m.njnt - 1)
-  kind = mjstruct.view(m.jnt_type, m.njnt, np.int32)[joints]
-  axis = mjstruct.view(m.jnt_axis, (m.njnt, 3))[joints]
-  slides = (jntnum[free] == 3) & (kind == mujoco.mjtJoint.mjJNT_SLIDE).all(axis=1)
+  kind, axis = m.jnt_type[joints], m.jnt_axis[joints]
+  slides = (m.body_jntnum[body[free]] == 3) & (kind == mujoco.mjtJoint.mjJNT_SLIDE).all(axis=1)
   if not (slides & (np.abs(axis - np.eye(3)).max(axis=(1, 2)) < 1e-9)).all():
     raise ValueError(
       f"organ {name!r}: its vertices do not have three slide joints along x, y, z, expected "
       "flexcomp dof='full'"
     )
   dofadr, qposadr = np.full(len(body), -1), np.full(len(body), -1)
-  dofadr[free] = mjstruct.view(m.jnt_dofadr, m.njnt, np.int32)[first]
-  qposadr[free] = mjstruct.view(m.jnt_qposadr, m.njnt, np.int32)[first]
+  dofadr[free] = m.jnt_dofadr[first]
+  qposadr[free] = m.jnt_qposadr[first]
   return dofadr, qposadr

@@ -11,7 +11,7 @@ from . import mjstruct
 
 def name(m, flex: int) -> str:
   """Returns the name of a flex, or what to call it."""
-  return mjstruct.name_of(m, m.name_flexadr, flex) or f"flex {flex}"
+  return mjstruct.name_of(m, "flex", flex) or f"flex {flex}"
 
 
 def names(m, kind: str = "flex") -> list[str]:
@@ -19,25 +19,22 @@ def names(m, kind: str = "flex") -> list[str]:
   if kind == "flex":
     return [name(m, flex) for flex in range(m.nflex)]
   count = m.nu if kind == "actuator" else getattr(m, f"n{kind}")
-  return [mjstruct.name_of(m, getattr(m, f"name_{kind}adr"), k) for k in range(count)]
+  return [mjstruct.name_of(m, kind, k) for k in range(count)]
 
 
 def meeting_geoms(m, flex: int) -> np.ndarray:
   """Returns the geoms that collide with a flex."""
-  contype = mjstruct.view(m.geom_contype, m.ngeom, np.int32)
-  conaffinity = mjstruct.view(m.geom_conaffinity, m.ngeom, np.int32)
-  mine = mjstruct.view(m.flex_contype, m.nflex, np.int32)[flex]
-  meets = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)[flex]
-  return np.flatnonzero((contype & meets) | (conaffinity & mine))
+  mine, meets = m.flex_contype[flex], m.flex_conaffinity[flex]
+  return np.flatnonzero((m.geom_contype & meets) | (m.geom_conaffinity & mine))
 
 
 def rest_points(m, flex: int) -> np.ndarray:
   """Returns where the vertices of a flex are in the world in qpos0 [m], (n, 3)."""
-  start, count = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex]), vertices(m, flex)
-  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + count]
-  if mjstruct.view(m.flex_rigid, m.nflex, np.bool_)[flex]:
+  start, count = int(m.flex_vertadr[flex]), vertices(m, flex)
+  body = m.flex_vertbodyid[start : start + count]
+  if m.flex_rigid[flex]:
     body = np.full(count, body[0])  # the first one tells it while an organ is hidden
-  point = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + count].copy()
+  point = m.flex_vert[start : start + count].copy()
   for each in np.unique(body):
     rotation, position = body_frame(m, int(each))
     point[body == each] = point[body == each] @ rotation.T + position
@@ -46,12 +43,11 @@ def rest_points(m, flex: int) -> np.ndarray:
 
 def vertices(m, flex: int) -> int:
   """Returns the number of a flex's vertices; MuJoCo's own is 0 while an organ is hidden."""
-  return _extent(m.flex_vertadr, m.nflex, m.nflexvert, flex)
+  return _extent(m.flex_vertadr, m.nflexvert, flex)
 
 
-def _extent(addresses: int | None, nflex: int, total: int, flex: int) -> int:
-  adr = mjstruct.view(addresses, nflex, np.int32)
-  return int((adr[flex + 1] if flex + 1 < nflex else total) - adr[flex])
+def _extent(adr: np.ndarray, total: int, flex: int) -> int:
+  return int((adr[flex + 1] if flex + 1 < len(adr) else total) - adr[flex])
 
 
 def elements(m, flex: int) -> np.ndarray:
@@ -61,17 +57,15 @@ def elements(m, flex: int) -> np.ndarray:
 
 def element_data(m, flex: int, corners: int = 3) -> np.ndarray:
   """Returns MuJoCo's own memory of the triangles of a flex, or edges, (nelem, corners)."""
-  adr = int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[flex])
-  num = _extent(m.flex_elemadr, m.nflex, m.nflexelem, flex)
-  elem = mjstruct.view(m.flex_elem, m.nflexelemdata, np.int32)
-  return elem[adr : adr + corners * num].reshape(num, corners)
+  adr = int(m.flex_elemdataadr[flex])
+  num = _extent(m.flex_elemadr, m.nflexelem, flex)
+  return m.flex_elem[adr : adr + corners * num].reshape(num, corners)
 
 
 def rim_data(m, flex: int, count: int) -> np.ndarray:
   """Returns MuJoCo's own memory of the edges at the boundary of a flex, drawn as sides, (n, 2)."""
-  adr = int(mjstruct.view(m.flex_shelldataadr, m.nflex, np.int32)[flex]) if count else 0
-  shell = mjstruct.view(m.flex_shell, m.nflexshelldata, np.int32)
-  return shell[adr : adr + 2 * count].reshape(-1, 2)
+  adr = int(m.flex_shelldataadr[flex]) if count else 0
+  return m.flex_shell[adr : adr + 2 * count].reshape(-1, 2)
 
 
 def marks(m, flex: int) -> np.ndarray:
@@ -79,8 +73,8 @@ def marks(m, flex: int) -> np.ndarray:
 
   They are inverse weights of edges that no equality holds. mj_setConst makes them anew.
   """
-  edge = int(mjstruct.view(m.flex_edgeadr, m.nflex, np.int32)[flex])
-  return mjstruct.view(m.flexedge_invweight0, m.nflexedge)[edge : edge + 2]
+  edge = int(m.flex_edgeadr[flex])
+  return m.flexedge_invweight0[edge : edge + 2]
 
 
 def compiled_elements(m, flex: int) -> np.ndarray:
@@ -89,12 +83,10 @@ def compiled_elements(m, flex: int) -> np.ndarray:
   Cuts leave MuJoCo's edges alone. Those of a triangle are its sides from corner 1 to 2, 2 to 0 and
   0 to 1.
   """
-  adr = int(mjstruct.view(m.flex_elemedgeadr, m.nflex, np.int32)[flex])
-  num = _extent(m.flex_elemadr, m.nflex, m.nflexelem, flex)
-  first = int(mjstruct.view(m.flex_edgeadr, m.nflex, np.int32)[flex])
-  edge = mjstruct.view(m.flex_edge, (m.nflexedge, 2), np.int32)[first:]
-  side = mjstruct.view(m.flex_elemedge, m.nflexelemedge, np.int32)[adr : adr + 3 * num]
-  ends = edge[side.reshape(num, 3)]
+  adr = int(m.flex_elemedgeadr[flex])
+  num = _extent(m.flex_elemadr, m.nflexelem, flex)
+  side = m.flex_elemedge[adr : adr + 3 * num]
+  ends = m.flex_edge[int(m.flex_edgeadr[flex]) :][side.reshape(num, 3)]
   here, there = ends[:, [1, 2, 0]], ends[:, [2, 0, 1]]  # the sides that meet at each corner
   shared = (here[..., :1] == there).any(axis=-1)
   return np.ascontiguousarray(np.where(shared, here[..., 0], here[..., 1]))
@@ -103,9 +95,7 @@ def compiled_elements(m, flex: int) -> np.ndarray:
 def body_frame(m, body: int) -> tuple[np.ndarray, np.ndarray]:
   """Returns rotation and position of a body in qpos0."""
   rotation, position = np.eye(3), np.zeros(3)
-  parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
-  quat = mjstruct.view(m.body_quat, (m.nbody, 4))
-  pos = mjstruct.view(m.body_pos, (m.nbody, 3))
+  parentid, quat, pos = m.body_parentid, m.body_quat, m.body_pos
   while body > 0:
     own = matrix(quat[body])
     rotation, position = own @ rotation, pos[body] + own @ position

@@ -117,8 +117,8 @@ def of_dofs(m: mjstruct.Struct, organ: Declaration) -> np.ndarray:
   """Returns the inertia that the dofs of every node have in the model [kg], (nvert,)."""
   inertia = masses(m, organ).copy()
   own = organ.jointed
-  inertia[own] = mjstruct.view(m.body_mass, m.nbody)[organ.body[own]]
-  inertia[own] += mjstruct.view(m.dof_armature, m.nv)[organ.dofs].reshape(-1, 3)[:, 0]
+  inertia[own] = m.body_mass[organ.body[own]]
+  inertia[own] += m.dof_armature[organ.dofs].reshape(-1, 3)[:, 0]
   return inertia
 
 
@@ -128,7 +128,7 @@ def masses(m: mjstruct.Struct, organ: Declaration) -> np.ndarray:
     return organ.windows.mass
   if len(organ.mesh.tet):
     return organ.mass
-  return mjstruct.view(m.body_mass, m.nbody)[organ.body]
+  return m.body_mass[organ.body]
 
 
 def material(config: Config) -> tuple:
@@ -156,9 +156,7 @@ def _tool_radius(m: mjstruct.Struct, organ: Declaration, flex: int) -> float:
   """
   colliding = meeting_geoms(m, flex)
   limit = 0.25 * float(np.ptp(organ.mesh.rest, axis=0).max())
-  kind = mjstruct.view(m.geom_type, m.ngeom, np.int32)
-  size = mjstruct.view(m.geom_size, (m.ngeom, 3))
-  geom = mujoco.mjtGeom
+  kind, size, geom = m.geom_type, m.geom_size, mujoco.mjtGeom
   radius = 0.0
   for g in colliding:
     if kind[g] in (geom.mjGEOM_SPHERE, geom.mjGEOM_CAPSULE, geom.mjGEOM_CYLINDER):

@@ -33,6 +33,7 @@ _SCALAR = {
   "unsigned int": C.c_uint,
   "unsigned char": C.c_ubyte,
 }
+_NUMBERS = frozenset(_SCALAR.values()) - {C.c_char}
 
 
 def _ctype(declared: Any) -> type:
@@ -77,7 +78,6 @@ def declared(name: str) -> tuple[Any, tuple[int | str, ...]]:
 
 
 _KINDS = ("mjOption", "mjModel", "mjData")
-Struct = Any  # one of these, whose fields are known when MuJoCo is
 Model = _struct("mjModel")
 Data = _struct("mjData")
 Contact = _struct("mjContact")
@@ -130,16 +130,57 @@ def view(address: int | None, shape: Any, dtype: type = np.float64) -> np.ndarra
   return np.frombuffer(buffer, dtype).reshape(sizes)
 
 
-def array(m: Struct, name: str) -> np.ndarray:
-  """Returns the array of an mjModel that has a name, without a copy."""
-  kind, extents = declared(name)
-  shape = [getattr(m, n) if isinstance(n, str) else n for n in extents]
-  return view(getattr(m, name), shape, np.dtype(kind).type)
+class Struct:
+  """The mjModel or mjData at an address as the bindings have it: its numbers and its own arrays.
+
+  Args:
+    kind: `Model` or `Data`
+    address: of it
+    model: of an mjData, its mjModel, which has the sizes
+  """
+
+  def __init__(self, kind: Any, address: int, model: Any = None):
+    self.raw, self.address, self._model = kind.from_address(address), address, model
+
+  def __getattr__(self, name: str) -> Any:
+    value = getattr(self.raw, name)
+    known = _arrays(type(self.raw).__name__).get(name)
+    if known is None:
+      return value
+    kind, extents = known
+    shape = [getattr(self._of(n), n) if isinstance(n, str) else n for n in extents]
+    return view(value, shape, kind)
+
+  def _of(self, size: str) -> Any:
+    """Returns what has a size."""
+    if size.startswith("mj"):
+      return mujoco
+    return self.raw if self._model is None or hasattr(self.raw, size) else self._model
 
 
-def config(model: int, instance: int, key: str) -> str:
+@functools.cache
+def _arrays(kind: str) -> dict[str, tuple[Any, tuple[int | str, ...]]]:
+  """Returns type and shape of the arrays of numbers of mjModel or mjData."""
+  fields = structs.STRUCTS[kind].fields
+  arrays = [f for f in fields if isinstance(f.type, ast_nodes.PointerType) and f.array_extent]
+  found = {field.name: declared(field.name) for field in arrays}
+  return {n: (np.dtype(c).type, shape) for n, (c, shape) in found.items() if c in _NUMBERS}
+
+
+def model(address: int) -> Struct:
+  """Returns the mjModel at an address."""
+  return Struct(Model, address)
+
+
+def both(model: int, data: int) -> tuple[Struct, Struct]:
+  """Returns the mjModel and the mjData at two addresses."""
+  m = Struct(Model, model)
+  return m, Struct(Data, data, m)
+
+
+def config(m: Struct, instance: int, key: str) -> str:
   """Returns a plugin instance's configuration value, empty where it is not set."""
-  value = library().mj_getPluginConfig(model, instance, key.encode())
+  value = library().mj_getPluginConfig(m.address, instance, key.encode())
   return value.decode() if value else ""
 
 
@@ -178,10 +219,10 @@ class Identity:
     return same and self._sizes.tobytes() == self._were
 
 
-def name_of(m: C.Structure, addresses: int | None, index: int) -> str:
-  """Returns the name that starts at `m.names[addresses[index]]`."""
-  start = int(view(addresses, index + 1, np.int32)[index])
-  return C.string_at(m.names + start).decode()  # pyright: ignore[reportAttributeAccessIssue]
+def name_of(m: Struct, kind: str, index: int) -> str:
+  """Returns the name of a flex, body, geom, ... of an mjModel."""
+  start = int(getattr(m, f"name_{kind}adr")[index])
+  return C.string_at(m.raw.names + start).decode()
 
 
 def check():

@@ -26,18 +26,17 @@ def fit(m: mjstruct.Struct, organ: Declaration, body: Body):
   """Makes a model fit an organ that it declares, with the tissue `body`."""
   # MuJoCo warns of a flex without forces of its own; an <edge damping> silences it and, zero here,
   # costs nothing while running. The plugin's own damping acts instead.
-  mjstruct.view(m.flex_edgedamping, m.nflex)[organ.flexes] = 0.0
+  m.flex_edgedamping[organ.flexes] = 0.0
   if organ.windows is None:
     give_armature(m, organ, body, organ.config)
     if len(organ.mesh.tet):
       give_weights(m, organ)
     return
   win = organ.windows
-  mjstruct.view(m.body_pos, (m.nbody, 3))[win.body] = win.stand
+  m.body_pos[win.body] = win.stand
   # A slot must be no heavier than the lightest node that it may stand on.
-  mass = mjstruct.view(m.body_mass, m.nbody)
   light = win.mass[win.mass > 0].min() / (_PARTS if organ.mesh.spare else 1)
-  mass[win.body] = np.minimum(mass[win.body], light)
+  m.body_mass[win.body] = np.minimum(m.body_mass[win.body], light)
 
 
 def fit_thread(m: mjstruct.Struct, flex: int, body: np.ndarray):
@@ -46,12 +45,11 @@ def fit_thread(m: mjstruct.Struct, flex: int, body: np.ndarray):
   The inertia of its nodes is that of each step. Contacts would be soft by their masses, of a
   microgram.
   """
-  mjstruct.view(m.flex_edgedamping, m.nflex)[flex] = 0.0
-  margin = mjstruct.view(m.flex_margin, m.nflex)
-  margin[flex] = max(margin[flex], _AHEAD * mjstruct.view(m.flex_radius, m.nflex)[flex])
-  dof = mjstruct.view(m.body_dofadr, m.nbody, np.int32)[body][:, None] + np.arange(3)
-  mjstruct.view(m.body_invweight0, (m.nbody, 2))[body, 0] = 1 / _FIRM
-  mjstruct.view(m.dof_invweight0, m.nv)[dof] = 1 / _FIRM
+  m.flex_edgedamping[flex] = 0.0
+  m.flex_margin[flex] = max(m.flex_margin[flex], _AHEAD * m.flex_radius[flex])
+  dof = m.body_dofadr[body][:, None] + np.arange(3)
+  m.body_invweight0[body, 0] = 1 / _FIRM
+  m.dof_invweight0[dof] = 1 / _FIRM
 
 
 def give_armature(m: mjstruct.Struct, organ: Declaration, body: Body, config: Config):
@@ -67,7 +65,7 @@ def give_armature(m: mjstruct.Struct, organ: Declaration, body: Body, config: Co
   """
   if not SCHEMES[organ.config.integrator].spreads:
     return  # steps are those of the masses
-  armature = mjstruct.view(m.dof_armature, m.nv)
+  armature = m.dof_armature
   dofs = organ.dofs
   present = armature[dofs]
   of = (float(m.opt.timestep), *inertia.material(config))
@@ -75,7 +73,7 @@ def give_armature(m: mjstruct.Struct, organ: Declaration, body: Body, config: Co
     return
   mass = inertia.masses(m, organ)
   found = inertia.of_nodes(m, organ, body, config, mass, organ.flex)
-  theirs, own = mjstruct.view(m.body_mass, m.nbody)[organ.body], organ.jointed
+  theirs, own = m.body_mass[organ.body], organ.jointed
   total = np.maximum(found, theirs)[own]  # of solids, MuJoCo's mass of a node may be more
   added = np.repeat(total - theirs[own], 3)
   armature[dofs] = added
@@ -84,7 +82,7 @@ def give_armature(m: mjstruct.Struct, organ: Declaration, body: Body, config: Co
   _made_for[_digest(added)] = of
   # mj_setConst gives the same: M0 has the armature, the inverse weights, which scale the contacts'
   # softness, are those of the masses alone for such dofs.
-  mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(total, 3)
+  m.dof_M0[dofs] = np.repeat(total, 3)
 
 
 def give_weights(m: mjstruct.Struct, organ: Declaration):
@@ -95,8 +93,8 @@ def give_weights(m: mjstruct.Struct, organ: Declaration):
   own = organ.jointed
   mass = organ.mass[own]
   weight = 1 / np.where(mass > 0, mass, mass[mass > 0].mean())  # some wait for cuts
-  mjstruct.view(m.body_invweight0, (m.nbody, 2))[organ.body[own], 0] = weight
-  mjstruct.view(m.dof_invweight0, m.nv)[organ.dofs] = np.repeat(weight, 3)
+  m.body_invweight0[organ.body[own], 0] = weight
+  m.dof_invweight0[organ.dofs] = np.repeat(weight, 3)
 
 
 def show(m: mjstruct.Struct, organ: Declaration, shown: bool):
@@ -111,10 +109,10 @@ def show(m: mjstruct.Struct, organ: Declaration, shown: bool):
   counts = (nvert, mesh.nelem, shells) if shown else (0, 0, shells + mesh.nelem)
   names = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
   for name, count in zip(names, (*counts, 0, -1), strict=True):
-    mjstruct.view(getattr(m, name), m.nflex, np.int32)[flex] = count
+    getattr(m, name)[flex] = count
   # The broad phase passes over vertices of the world; the first one still tells whose they are.
-  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
-  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + nvert]
+  start = int(m.flex_vertadr[flex])
+  body = m.flex_vertbodyid[start : start + nvert]
   body[1:] = body[0] if shown else 0
 
 
@@ -125,8 +123,8 @@ def drawn(mesh: Mesh) -> int:
 
 def group(m: mjstruct.Struct, skin: int, flex: int, groups: tuple[int, int]):
   """Puts an organ's skin and its own surface into groups, which viewers draw or do not."""
-  mjstruct.view(m.skin_group, m.nskin, np.int32)[skin] = groups[0]
-  mjstruct.view(m.flex_group, m.nflex, np.int32)[flex] = groups[1]
+  m.skin_group[skin] = groups[0]
+  m.flex_group[flex] = groups[1]
 
 
 def _digest(values: np.ndarray) -> bytes:

@@ -62,9 +62,7 @@ def read(m: mjstruct.Struct, organ: Declaration) -> Skin | None:
       "palpate.add_skin"
     )
   k, who = names.index(name), f"organ {organ.name!r}: skin {name!r}"
-  adr, count = (
-    int(mjstruct.view(each, m.nskin, np.int32)[k]) for each in (m.skin_vertadr, m.skin_vertnum)
-  )
+  adr, count = int(m.skin_vertadr[k]), int(m.skin_vertnum[k])
   # MuJoCo's triangles: those of the physics may have other diagonals.
   elem = organ.mesh.elem if organ.mesh.spare else flexes.elements(m, organ.flex)
   sizes = subdivide.counts(elem)
@@ -75,21 +73,17 @@ def read(m: mjstruct.Struct, organ: Declaration) -> Skin | None:
       "four once, twice, ...; see palpate.add_skin"
     )
   smooth = subdivide.smooth(elem, subdivide.LEVELS[sizes.index(count)])
-  first, faces = (
-    int(mjstruct.view(each, m.nskin, np.int32)[k]) for each in (m.skin_faceadr, m.skin_facenum)
-  )
-  face = mjstruct.view(m.skin_face, (m.nskinface, 3), np.int32)[first : first + faces]
+  first = int(m.skin_faceadr[k])
+  face = m.skin_face[first : first + int(m.skin_facenum[k])]
   if not np.array_equal(face, smooth.elem):
     raise ValueError(f"{who} has other triangles than the organ's divided in four")
-  bones = int(mjstruct.view(m.skin_bonenum, m.nskin, np.int32)[k])
-  bone = int(mjstruct.view(m.skin_boneadr, m.nskin, np.int32)[k])
-  held = int(mjstruct.view(m.skin_bonevertnum, m.nskinbone, np.int32)[bone])
+  bones, bone = int(m.skin_bonenum[k]), int(m.skin_boneadr[k])
+  held = int(m.skin_bonevertnum[bone])
   if bones != 1 or held != count:
     raise ValueError(f"{who} has {bones} bones, expected one that has all vertices")
-  group = int(mjstruct.view(m.skin_group, m.nskin, np.int32)[k])
-  own = int(mjstruct.view(m.flex_group, m.nflex, np.int32)[organ.flex])
+  groups = int(m.skin_group[k]), int(m.flex_group[organ.flex])
   rest = organ.mesh.rest[: organ.mesh.nouter]
-  return Skin(k, smooth, _height(m, adr, smooth, rest), adr, bone, (group, own))
+  return Skin(k, smooth, _height(m, adr, smooth, rest), adr, bone, groups)
 
 
 def _height(m: mjstruct.Struct, adr: int, smooth: Smooth, rest: np.ndarray) -> np.ndarray:
@@ -98,7 +92,7 @@ def _height(m: mjstruct.Struct, adr: int, smooth: Smooth, rest: np.ndarray) -> n
   Both are in the frame of the body that the organ is in; a skin is bound to that.
   """
   base = smooth(rest)
-  declared = mjstruct.view(m.skin_vert, (m.nskinvert, 3), np.float32)[adr : adr + len(base)]
+  declared = m.skin_vert[adr : adr + len(base)]
   return np.einsum("ij,ij->i", declared - base, topology.vertex_normals(base, smooth.elem))
 
 
@@ -112,22 +106,17 @@ def place(skin: Skin, vertices: np.ndarray) -> np.ndarray:
 
 def draw(w: Workspace, model: int, data: int):
   """Writes an organ's skin where renderers read it, from `flexvert_xpos`."""
-  m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
+  m, d = mjstruct.both(model, data)
   organ, skin = w.organ, w.skin
   assert skin is not None
-  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[organ.flex])
-  n = organ.mesh.nouter
-  coarse = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
-  fine = place(skin, coarse)
+  start = int(m.flex_vertadr[organ.flex])
+  fine = place(skin, d.flexvert_xpos[start : start + organ.mesh.nouter])
   # MuJoCo moves the vertices from where they are bound to where the bone is: this takes it back.
-  body = int(mjstruct.view(m.skin_bonebodyid, m.nskinbone, np.int32)[skin.bone])
-  pos = mjstruct.view(d.xpos, (m.nbody, 3))[body]
-  mat = mjstruct.view(d.xmat, (m.nbody, 9))[body].reshape(3, 3)
-  turn = mjstruct.view(m.skin_bonebindquat, (m.nskinbone, 4), np.float32)[skin.bone]
-  bound = (fine - pos) @ mat @ flexes.matrix(turn).T
-  bound += mjstruct.view(m.skin_bonebindpos, (m.nskinbone, 3), np.float32)[skin.bone]
-  out = mjstruct.view(m.skin_vert, (m.nskinvert, 3), np.float32)
-  out[skin.adr : skin.adr + len(fine)] = bound
+  body = int(m.skin_bonebodyid[skin.bone])
+  turn = flexes.matrix(m.skin_bonebindquat[skin.bone])
+  bound = (fine - d.xpos[body]) @ d.xmat[body].reshape(3, 3) @ turn.T
+  bound += m.skin_bonebindpos[skin.bone]
+  m.skin_vert[skin.adr : skin.adr + len(fine)] = bound
 
 
 def show(w: Workspace, model: int, shown: bool):
@@ -135,4 +124,4 @@ def show(w: Workspace, model: int, shown: bool):
   assert w.skin is not None
   usual, hidden = w.skin.groups
   groups = (usual, hidden) if shown else (hidden, usual)
-  prepare.group(mjstruct.Model.from_address(model), w.skin.index, w.organ.flex, groups)
+  prepare.group(mjstruct.model(model), w.skin.index, w.organ.flex, groups)

@@ -14,21 +14,20 @@ Frame = tuple[np.ndarray, np.ndarray]  # rotation to the world, and origin [m]
 _NEAR = 0.1  # of its size: closer than that to an organ, a flex is beside it
 
 
-def read(model: int, instance: int) -> Declaration:
+def read(m: mjstruct.Struct, instance: int) -> Declaration:
   """Returns the organ that plugin instance `instance` declares: a rigid flex, with windows.
 
   Raises:
     ValueError: the declaration is not one this plugin can run.
   """
   devices.init()
-  m = mjstruct.Model.from_address(model)
   flex, parent = _surface(m, instance)
   name = flexes.name(m, flex)
   frame, origin = declare.static_frame(m, name, parent)
   nvert = flexes.vertices(m, flex)
-  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
-  rest = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + nvert].copy()
-  config, mesh = declare.read_mesh(m, name, declare.keys(model, instance), rest, flex)
+  start = int(m.flex_vertadr[flex])
+  rest = m.flex_vert[start : start + nvert].copy()
+  config, mesh = declare.read_mesh(m, name, declare.keys(m, instance), rest, flex)
   declare.check_volume(name, mesh, config)
   if config.elements == "solid":
     mesh = declare.fill_inside(name, mesh, config)
@@ -41,8 +40,8 @@ def read(model: int, instance: int) -> Declaration:
     raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
   share = fill.vertex_volumes(mesh) if len(mesh.tet) else topology.vertex_areas(rest, mesh.elem)
   mass = config.mass * share / share.sum()
-  windows = _windows(model, m, instance, name, config, mesh, mass, (frame, origin))
-  _check_neighbours(m, model, instance, name, windows, frame, origin, rest)
+  windows = _windows(m, instance, name, config, mesh, mass, (frame, origin))
+  _check_neighbours(m, instance, name, windows, frame, origin, rest)
   absent = np.full(mesh.nvert, -1)
   return declare.cached(
     float(m.opt.timestep),
@@ -55,7 +54,7 @@ def read(model: int, instance: int) -> Declaration:
 def _surface(m: mjstruct.Struct, instance: int) -> tuple[int, int]:
   """Returns the rigid flex that is the organ and the body that it is in."""
   bodies, mine = _rigid_flexes(m, instance)
-  who = mjstruct.name_of(m, m.name_bodyadr, int(bodies[0]))
+  who = mjstruct.name_of(m, "body", int(bodies[0]))
   if len(mine) != 1:
     raise ValueError(
       f"plugin palpate.organ with window on body {who!r}: {len(mine)} rigid flexcomps there, "
@@ -65,7 +64,7 @@ def _surface(m: mjstruct.Struct, instance: int) -> tuple[int, int]:
   name = flexes.name(m, flex)
   declare.check_surface(m, flex, name)
   for key in ("contype", "conaffinity"):
-    value = mjstruct.view(getattr(m, f"flex_{key}"), m.nflex, np.int32)[flex]
+    value = getattr(m, f"flex_{key}")[flex]
     if value:
       raise ValueError(f"organ {name!r}: {key} is {value}, expected 0: its windows collide for it")
   return flex, int(bodies[0])
@@ -73,15 +72,12 @@ def _surface(m: mjstruct.Struct, instance: int) -> tuple[int, int]:
 
 def _rigid_flexes(m: mjstruct.Struct, instance: int) -> tuple[np.ndarray, list[int]]:
   """Returns the bodies of a plugin instance and the rigid flexes in them."""
-  bodies = np.flatnonzero(mjstruct.view(m.body_plugin, m.nbody, np.int32) == instance)
-  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
-  vertbody = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
-  rigid = mjstruct.view(m.flex_rigid, m.nflex, np.bool_)
-  return bodies, [f for f in range(m.nflex) if rigid[f] and vertbody[start[f]] in bodies]
+  bodies = np.flatnonzero(m.body_plugin == instance)
+  mine = m.flex_rigid.astype(bool) & np.isin(m.flex_vertbodyid[m.flex_vertadr], bodies)
+  return bodies, np.flatnonzero(mine).tolist()
 
 
 def _windows(
-  model: int,
   m: mjstruct.Struct,
   instance: int,
   name: str,
@@ -91,15 +87,15 @@ def _windows(
   place: Frame,
 ) -> Windows:
   """Returns the window of an organ, and where it stands at rest."""
-  flex = _claimed(model, m, instance, name, config)
+  flex = _claimed(m, instance, name, config)
   body, dofadr, qposadr, offset, turn = _slots(m, name, config.window, flex, place)
-  elem_num = int(mjstruct.view(m.flex_elemnum, m.nflex, np.int32)[flex])
+  elem_num = int(m.flex_elemnum[flex])
   # At rest the window stands on a patch of its own: its bodies move there, so that qpos0 fits.
   # The last slot stays free; a patch of n nodes has up to 2 n - 4 triangles: `windows/proxy.h`.
   room = min(len(body) - 1, elem_num // 2 + 2)
   home = _home_slots(mesh.elem, mesh.nouter, len(body), room)
   used = home >= 0
-  stand = mjstruct.view(m.body_pos, (m.nbody, 3))[body]
+  stand = m.body_pos[body]
   stand[used] = np.einsum("kij,kj->ki", turn[used], offset[used] + mesh.rest[home[used]])
   return Windows(
     flex=flex,
@@ -109,18 +105,18 @@ def _windows(
     home=home,
     stand=stand,
     qhome=offset - np.einsum("kji,kj->ki", turn, stand),
-    elem_adr=int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[flex]),
+    elem_adr=int(m.flex_elemdataadr[flex]),
     elem_num=elem_num,
     geom=_followed(m, name, config, flex),
-    line=_lines(model, m, instance, config, flex),
+    line=_lines(m, instance, config, flex),
     mass=mass,
   )
 
 
-def _claimed(model: int, m: mjstruct.Struct, instance: int, name: str, config: Config) -> int:
+def _claimed(m: mjstruct.Struct, instance: int, name: str, config: Config) -> int:
   """Returns the flex that an organ names as its window and nobody else does."""
   names = flexes.names(m)
-  surface = _surfaces(model, m, instance, without=instance)
+  surface = _surfaces(m, instance, without=instance)
   what = f"organ {name!r}: window {config.window!r}"
   found = flexes.resolve(config.window, name, names)
   if found is None:
@@ -138,10 +134,10 @@ def _slots(
 ) -> tuple[np.ndarray, ...]:
   """Returns body, first dof, first qpos, offset from the organ and turn of each of its slots."""
   what = f"organ {name!r}: window {window!r}"
-  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
+  start = int(m.flex_vertadr[flex])
   count = flexes.vertices(m, flex)
-  own = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + count].copy()
-  jointed = mjstruct.view(m.body_jntnum, m.nbody, np.int32)[own] > 0
+  own = m.flex_vertbodyid[start : start + count].copy()
+  jointed = m.body_jntnum[own] > 0
   try:
     declare.check_surface(m, flex, window)
     declare.check_flex(m, flex, window)
@@ -171,19 +167,17 @@ def _followed(m: mjstruct.Struct, name: str, config: Config, flex: int) -> np.nd
 
 def _tips(m: mjstruct.Struct, name: str, config: Config) -> list[int]:
   """Returns the last geom of each needle that goes through an organ: that of its tip."""
-  bodyid = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
   bodies = [flexes.find(m, "body", row.name, name) for row in config.needles]
-  geoms = [np.flatnonzero(bodyid == body) for body in bodies]
+  geoms = [np.flatnonzero(m.geom_bodyid == body) for body in bodies]
   return [int(each[-1]) for each in geoms if len(each)]
 
 
 def _tools(m: mjstruct.Struct, name: str, config: Config, flex: int) -> list[int]:
   """Returns the geoms that collide with a window and that it follows."""
-  bodyid = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
-  meets = flexes.meeting_geoms(m, flex)
+  bodyid, meets = m.geom_bodyid, flexes.meeting_geoms(m, flex)
   if not config.follow:
-    weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)
-    return [g for g in meets if weld[bodyid[g]] or not config.held]
+    moves = m.body_weldid[bodyid] > 0
+    return [g for g in meets if moves[g] or not config.held]
   wanted = set()
   for body in config.follow:
     found = flexes.need(m, "body", body, name, "follow")
@@ -196,34 +190,26 @@ def _tools(m: mjstruct.Struct, name: str, config: Config, flex: int) -> list[int
   return [g for g in meets if bodyid[g] in wanted]
 
 
-def _lines(model: int, m: mjstruct.Struct, instance: int, config: Config, flex: int) -> np.ndarray:
+def _lines(m: mjstruct.Struct, instance: int, config: Config, flex: int) -> np.ndarray:
   """Returns the first vertex of each edge that a window follows, of threads that it may touch."""
-  kind, meets, start, body = (
-    mjstruct.view(getattr(m, f"flex_{key}"), size, np.int32)
-    for key, size in (
-      ("contype", m.nflex), ("conaffinity", m.nflex), ("vertadr", m.nflex),
-      ("vertbodyid", m.nflexvert),
-    )
-  )  # fmt: skip
-  moves = mjstruct.view(m.body_dofnum, m.nbody, np.int32)[body] > 0
+  kind, meets, start = m.flex_contype, m.flex_conaffinity, m.flex_vertadr
+  moves = m.body_dofnum[m.flex_vertbodyid] > 0
   found = []
-  for thread in _threads(model, m, instance):
+  for thread in _threads(m, instance):
     if not config.follow and (kind[thread] & meets[flex] or kind[flex] & meets[thread]):
       first = start[thread] + np.arange(flexes.vertices(m, thread) - 1)
       found.append(first[moves[first] | moves[first + 1]])
   return np.concatenate([np.zeros(0, np.int64), *found])
 
 
-def _threads(model: int, m: mjstruct.Struct, instance: int) -> list[int]:
+def _threads(m: mjstruct.Struct, instance: int) -> list[int]:
   """Returns the flexes that are threads of the plugin that has an instance."""
-  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
-  mine = [k for k in range(m.nplugin) if plugin[k] == plugin[instance]]
-  return [declare.flex_of(m, k) for k in mine if declare.is_rod(model, k)]
+  mine = np.flatnonzero(m.plugin == m.plugin[instance]).tolist()
+  return [declare.flex_of(m, k) for k in mine if declare.is_rod(m, k)]
 
 
 def _check_neighbours(
   m: mjstruct.Struct,
-  model: int,
   instance: int,
   name: str,
   windows: Windows,
@@ -235,23 +221,21 @@ def _check_neighbours(
 
   Windows follow geoms and edges of threads: they would not be there.
   """
-  own = np.arange(m.nflex) == windows.flex
-  contype = mjstruct.view(m.flex_contype, m.nflex, np.int32)
-  conaffinity = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)
-  surface = _surfaces(model, m, instance, without=instance)
-  bearing = _bearing(model, m, name)
+  contype, conaffinity, own = m.flex_contype, m.flex_conaffinity, windows.flex
+  surface = _surfaces(m, instance, without=instance)
+  bearing = _bearing(m, name)
   points = origin + rest @ frame.T
   room = _NEAR * float(np.linalg.norm(np.ptp(points, axis=0)))
   low, high = points.min(axis=0) - room, points.max(axis=0) + room
-  first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
-  for f in np.flatnonzero(~own):
+  first = m.flex_vertadr
+  for f in np.flatnonzero(np.arange(m.nflex) != own):
     if np.isin(first[f] + np.arange(flexes.vertices(m, int(f))), windows.line).any():
       continue
     if flexes.name(m, surface.get(int(f), int(f))) in bearing:
       continue
     meets = (contype[f] & conaffinity[own]) | (conaffinity[f] & contype[own])
     other = flexes.rest_points(m, surface.get(int(f), int(f)))
-    if meets.any() and (other.max(axis=0) > low).all() and (other.min(axis=0) < high).all():
+    if meets and (other.max(axis=0) > low).all() and (other.min(axis=0) < high).all():
       raise ValueError(
         f"organ {name!r}: its windows follow geoms and would not feel flex "
         f"{flexes.name(m, surface.get(int(f), int(f)))!r} beside it; use nodal coupling, or "
@@ -259,40 +243,37 @@ def _check_neighbours(
       )
 
 
-def _bearing(model: int, m: mjstruct.Struct, name: str) -> set[str]:
+def _bearing(m: mjstruct.Struct, name: str) -> set[str]:
   """Returns the organs on which one rests, and those that rest on it."""
   names = flexes.names(m)
   found = {}
   for other in range(m.nplugin):
     for flex in _rigid_flexes(m, other)[1]:
-      support = mjstruct.config(model, other, "support").split()
+      support = mjstruct.config(m, other, "support").split()
       found[names[flex]] = {flexes.resolve(each, names[flex], names) for each in support}
   return {each for each in names if name in found.get(each, ()) or each in found.get(name, ())}
 
 
 def touching(model: int, instance: int) -> np.ndarray:
   """Returns the flexes that meet tools for this plugin's organs, of which one is an instance."""
-  m = mjstruct.Model.from_address(model)
-  owner = mjstruct.view(m.body_plugin, m.nbody, np.int32)
-  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
+  m = mjstruct.model(model)
+  owner, plugin = m.body_plugin, m.plugin
   ours = np.flatnonzero((owner >= 0) & (plugin[owner] == plugin[instance]))
-  rigid = mjstruct.view(m.flex_rigid, m.nflex, np.bool_)
-  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
-  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
+  rigid, start, body = m.flex_rigid, m.flex_vertadr, m.flex_vertbodyid
   own = [np.isin(body[start[f] : start[f] + flexes.vertices(m, f)], ours) for f in range(m.nflex)]
   nodal = [f for f in range(m.nflex) if not rigid[f] and own[f].any()]
-  return np.array([*nodal, *_surfaces(model, m, instance)], int)
+  return np.array([*nodal, *_surfaces(m, instance)], int)
 
 
-def _surfaces(model: int, m: mjstruct.Struct, instance: int, without: int = -1) -> dict[int, int]:
+def _surfaces(m: mjstruct.Struct, instance: int, without: int = -1) -> dict[int, int]:
   """Returns the flex of the organ that each window is of, of all organs or without one."""
   names = flexes.names(m)
-  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
+  plugin = m.plugin
   found = {}
   for other in range(m.nplugin):
     if other != without and plugin[other] == plugin[instance]:
       for flex in _rigid_flexes(m, other)[1]:
-        window = mjstruct.config(model, other, "window").strip()
+        window = mjstruct.config(m, other, "window").strip()
         resolved = flexes.resolve(window, names[flex], names)
         if resolved in names:
           found[names.index(resolved)] = flex

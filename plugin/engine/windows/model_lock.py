@@ -17,8 +17,6 @@ import time
 import weakref
 from typing import Any
 
-import numpy as np
-
 from ..model import mjstruct
 from ..model.declare import Windows
 
@@ -54,9 +52,9 @@ class Turn:
 
   def bind(self, model: int, windows: Windows):
     """Points at the mark and the lock of a model, or of a copy."""
-    m = mjstruct.Model.from_address(model)
-    edge = int(mjstruct.view(m.flex_edgeadr, m.nflex, np.int32)[windows.flex])
-    self._found = mjstruct.view(m.flexedge_invweight0, m.nflexedge)[edge:].data
+    m = mjstruct.model(model)
+    edge = int(m.flex_edgeadr[windows.flex])
+    self._found = m.flexedge_invweight0[edge:].data
     self.lock = _locks.setdefault(model, self.lock)
 
   @property

@@ -8,12 +8,11 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.kernels import Kernel, aim
-from palpate.tissue.types import doubles, fill, flags, floats, ints, longs, struct
+from palpate.tissue.types import also, doubles, fill, flags, floats, ints, longs, struct
 
 from .. import coupling
 from ..coupling import Mujoco
 from ..layout import FLAG, Inbox, Outbox, WindowState
-from ..model import mjstruct
 
 if TYPE_CHECKING:
   from ..host import Host
@@ -96,22 +95,14 @@ place, gather, scatter, leave, choose, foresee = coupling.kernels(
 
 
 @struct
+@also(Slots, "nvert", "radius", "rest", "touch", "node_mass", "free", "elem", "begin", "following")
 class Reshaping:
   """The slots' vertices, and the mesh that they are to take over."""
 
-  nvert: int
   nelem: int
   most: int  # neighbours that a vertex has room for
   nchanged: int
-  radius: wp.float64  # see `Slots`
   wall: wp.float64  # mass of pinned nodes [kg]
-  rest: doubles("nvert", 3)  # see `Slots`, these and what follows
-  touch: doubles("nvert")
-  node_mass: doubles("nvert")
-  free: ints("nvert")
-  elem: ints("nroom", 3)
-  begin: ints("nvert")
-  following: ints("nroom")
   vert: longs("nchanged")  # vertices that something has changed at
   mesh_rest: doubles("nvert", 3)  # see `Mesh`
   mesh_elem: longs("nelem", 3)
@@ -146,16 +137,10 @@ def make(
   """
   m, organ, win, mesh = host.m, host.organ, host.organ.window, host.organ.mesh
   lengths, longest = _edges(mesh)
-  radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex])
-  margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex])
-  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
-  thread = np.searchsorted(start, win.line, side="right") - 1  # the flex of each edge
-  margins = (
-    *mjstruct.view(m.geom_margin, m.ngeom)[win.geom],
-    *mjstruct.view(m.flex_margin, m.nflex)[thread],
-  )
-  margin += float(max(margins, default=0.0))
-  thick = mjstruct.view(m.flex_radius, m.nflex)[thread]
+  radius, margin = float(m.flex_radius[win.flex]), float(m.flex_margin[win.flex])
+  thread = np.searchsorted(m.flex_vertadr, win.line, side="right") - 1  # the flex of each edge
+  margin += float(max((*m.geom_margin[win.geom], *m.flex_margin[thread]), default=0.0))
+  thick = m.flex_radius[thread]
   room = max(mesh.whole.nelem, sizes["ncorner"])
   values = {**boxes} | {name: kept[name] for name in scratch(0, 0)} | dict(
     nvert=sizes["nvert"],

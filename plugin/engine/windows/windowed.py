@@ -228,7 +228,7 @@ class Phases(coupling.Phases):
 
 def settle(w: Workspace, model: int):
   """Readies the state for the default slots."""
-  set_inertia(w, mjstruct.Model.from_address(model))
+  set_inertia(w, mjstruct.model(model))
   w.host.state.fill_(0.0)  # MuJoCo has not cleared it yet
 
 
@@ -243,7 +243,7 @@ def find_astray(w: Workspace) -> float:
   used = np.flatnonzero(node >= 0)
   node = node[used].astype(int)
   first = win.qposadr[used, None] + np.arange(3)
-  qpos = mjstruct.view(mjstruct.Data.from_address(w.data).qpos, first.max(initial=-1) + 1)[first]
+  qpos = w.host.d.qpos[first]
   disp = own.motion.disp.numpy()[node]
   return float(np.abs(qpos - win.qhome[used] - w.organ.mesh.rest[node] - disp).max(initial=0.0))
 
@@ -251,7 +251,7 @@ def find_astray(w: Workspace) -> float:
 def hide(w: Workspace):
   """Hides the organ's flex from MuJoCo until it is drawn again."""
   if w.seen.counts[0]:
-    prepare.show(mjstruct.Model.from_address(w.model), w.organ, shown=False)
+    prepare.show(mjstruct.model(w.model), w.organ, shown=False)
 
 
 def let_sleep(w: Workspace, allowed: bool):
@@ -260,16 +260,16 @@ def let_sleep(w: Workspace, allowed: bool):
   It does so itself where `<flag sleep="enable"/>` is set: it then spends next to nothing on dofs
   that have nothing to do while the organ sleeps.
   """
-  m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
-  tree = mjstruct.view(m.body_treeid, m.nbody, np.int32)[w.organ.window.body]
+  m, d = mjstruct.both(w.model, w.data)
+  tree = m.body_treeid[w.organ.window.body]
   policy = mujoco.mjtSleepPolicy
   may = policy.mjSLEEP_AUTO_ALLOWED if allowed else policy.mjSLEEP_AUTO_NEVER
-  mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[tree] = int(may)
-  if allowed or (mjstruct.view(d.tree_asleep, m.ntree, np.int32)[tree] < 0).all():
+  m.tree_sleep_policy[tree] = int(may)
+  if allowed or (d.tree_asleep[tree] < 0).all():
     return
   find_contacts_again(w)  # trees that may not sleep wake
   mjstruct.library().mj_comVel(w.model, w.data)
-  mjstruct.view(d.qfrc_passive, m.nv)[w.organ.dofs] = 0.0
+  d.qfrc_passive[w.organ.dofs] = 0.0
   wp.capture_launch(w.graphs.before)
 
 
@@ -279,12 +279,11 @@ def find_contacts_again(w: Workspace):
   It keeps the inertias of all other dofs: another organ may have raised its own in this step.
   Threads that have taken theirs take it anew, from the rows that there are now.
   """
-  m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
+  m, d = mjstruct.both(w.model, w.data)
   other = np.ones(m.nv, bool)
   other[w.organ.dofs] = False
-  row = np.repeat(other, mjstruct.view(m.M_rownnz, m.nv, np.int32))
-  kept = [(mjstruct.view(d.M, m.nC), row), (mjstruct.view(d.qLD, m.nC), row)]
-  kept += [(mjstruct.view(d.qLDiagInv, m.nv), other)]
+  row = np.repeat(other, m.M_rownnz)
+  kept = [(d.M, row), (d.qLD, row), (d.qLDiagInv, other)]
   values = [array[which].copy() for array, which in kept]
   safe_calls.find_contacts(w.model, w.data)
   for (array, which), were in zip(kept, values, strict=True):
@@ -326,13 +325,13 @@ def shortage(w: Workspace) -> str | None:
 
 def draw(w: Workspace, model: int, data: int):
   """Writes the deformed surface where renderers read it."""
-  m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
+  m, d = mjstruct.both(model, data)
   organ = w.organ
-  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[organ.flex])
+  start = int(m.flex_vertadr[organ.flex])
   n = prepare.drawn(organ.mesh)
   prepare.show(m, organ, shown=True)
   if w.graphs.resident:
     w.graphs.resident.fetch()
-  out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
+  out = d.flexvert_xpos[start : start + n]
   disp = w.host.own.motion.disp.numpy()[:n]
   out[:] = organ.origin + (organ.mesh.rest[:n] + disp) @ organ.frame.T

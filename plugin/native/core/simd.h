@@ -240,6 +240,16 @@ PALPATE S3 square(V s, V3 a) {
 // One of the `nthread` threads that work on a world; on the CPU there is one.
 struct Thread { int world, tid, nthread; };
 
+// Leads arrays to a row, or to the only one of all worlds: a kernel's to what its world has of its own. A
+// world's row is the first where all have the same.
+template <class... Arrays>
+PALPATE void move_each(int row, Arrays&... arrays) {
+  const auto at = [&](int count) { return (size_t)(count > 1 ? row : 0); };
+  ((arrays.data += at(arrays.shape[0]) * ((size_t)arrays.strides[0] / sizeof(*arrays.data))), ...);
+}
+template <class Array>
+PALPATE int own_row(const Array& rows, int world) { return rows.data ? rows.data[world] : 0; }
+
 // The numbers of a world that may change while running, see `Tissue.number`.
 template <class Fields>
 PALPATE const float* numbers(const Fields& f, int world) {

@@ -9,11 +9,11 @@ namespace palpate {
 template <class Fields>
 struct WorldContacts {
   const Fields& f;
-  int world, geom;
+  int geom;
 
-  PALPATE int count() const { return f.count.data[world]; }
+  PALPATE int count() const { return f.count.data[0]; }
 
-  PALPATE size_t contact(int k) const { return f.start.data[0] + f.before.data[world] + k; }
+  PALPATE size_t contact(int k) const { return f.start.data[0] + f.before.data[0] + k; }
 
   // Whether a contact is this tool's, or another's, with the organ, and where.
   PALPATE bool find(int k, bool own, Press& press) const {
@@ -31,16 +31,16 @@ struct WorldContacts {
     if (!find(k, true, press)) return false;
     const size_t c = contact(k);
     const int* slot = f.flex_elem.data + f.elemadr + 3 * ((const int*)f.elem.data)[2 * c + 1];
-    for (int q = 0; q < 3; ++q) press.corner[q] = f.slot_node.data[world * f.nslot + slot[q]];
+    for (int q = 0; q < 3; ++q) press.corner[q] = f.slot_node.data[slot[q]];
     press.gap = f.dist.data[c];
     press.measure(place(press.corner[0]), place(press.corner[1]), place(press.corner[2]));
     return true;
   }
 
   PALPATE D3 place(int node) const {
-    return at_rest(f, world, node) + load_lane(f.disp.data + at_node(f, world, node));
+    return load(f.rest.data + 3 * node) + load_lane(f.disp.data + offset_of(node));
   }
-  PALPATE D3 force(int node) const { return load(f.force.data + 3 * in_row(f, world, node)); }
+  PALPATE D3 force(int node) const { return load(f.force.data + 3 * node); }
 };
 
 // Finds how the contacts of each tool yield.
@@ -49,16 +49,15 @@ PALPATE void find_series(const Fields& f, Thread t, int) {
   each_item(t, f.ntool, [&](int q) {
     const int geom = f.tool_geom.data[q];
     if (geom < 0) return;  // an edge of a thread
-    const size_t g = (size_t)t.world * f.ngeom + geom;
-    const double* of = f.tool.data + (size_t)GEOM_LENGTH * (t.world * f.ntool + q);
-    const float* R = (const float*)f.geom_xmat.data + 9 * g;
-    const Tool tool = {(int)of[GEOM_TYPE], load((const float*)f.geom_xpos.data + 3 * g), {R[2], R[5], R[8]},
+    const double* of = f.tool.data + GEOM_LENGTH * q;
+    const float* R = (const float*)f.geom_xmat.data + 9 * geom;
+    const Tool tool = {(int)of[GEOM_TYPE], load((const float*)f.geom_xpos.data + 3 * geom), {R[2], R[5], R[8]},
                        of[GEOM_SIZE], f.radius};
-    const WorldContacts<Fields> all = {f, t.world, geom};
+    const WorldContacts<Fields> all = {f, geom};
     Dent dent;
     Series series = {0.0, 0.0};
     if (tool.is_known() && find_dent(all, tool, dent))
-      series = unresolved(all, tool, dent, f.tissue.data + TISSUE_LENGTH * t.world);
+      series = unresolved(all, tool, dent, f.tissue.data);
     Press press;
     for (int k = 0; k < all.count(); ++k) {
       if (!all.at(k, press)) continue;

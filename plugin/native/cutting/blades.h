@@ -37,20 +37,6 @@ constexpr double LEAVES = 0.8;  // cosine of a pull to the normal of a face by w
 enum { AWAY, PIERCING, THROUGH };  // stages
 enum { NOTHING, LONG, ENDED };  // what is due
 
-template <class Fields>
-PALPATE Fields of_world(Fields f, int world) {
-  move_bodies(f.mj, world);
-  move_nodes(f.own, world);
-  move_input(f.solve, world);
-  move_to(f.state, world), move_to(f.next, world), move_to(f.due, world), move_to(f.law, world);
-  move_to(f.force, world), move_to(f.point, world), move_to(f.share, world), move_to(f.hold, world);
-  move_to(f.held, world);
-  f.number.data += NUMBERS * world;
-  move_to(f.elem, f.mesh.data[world]), move_to(f.tet, f.mesh.data[world]);
-  move_to(f.flat, f.mesh.data[world]);
-  return f;
-}
-
 // What stretches a blade's spring: across the blade, and along the surface; not what is behind the end
 // of the cut, along `back`, where the blade came from.
 struct Stretch { D3 pull, flat, back; bool behind; double far; };
@@ -307,8 +293,7 @@ PALPATE int due_of(const Fields& f, const double* s) {
 // Adds the blades' forces to the solver's input, and finds what state they will be in. What is due is
 // kept until it is done where `keeps` says so, as long as there is a path.
 template <class Fields>
-PALPATE void enter_blades(const Fields& given, Thread t, int keeps) {
-  const Fields f = of_world(given, t.world);
+PALPATE void enter_blades(const Fields& f, Thread t, int keeps) {
   const D3 zero = {0.0, 0.0, 0.0};
   if (t.tid == 0) f.solve.quiet.data[0] = 0.0;
   for (int i = 0; i < f.nblade; ++i) {
@@ -332,9 +317,8 @@ PALPATE void enter_blades(const Fields& given, Thread t, int keeps) {
 
 // Ends the forces with what the step made of the seats' velocities, and lets the blades feel them.
 template <class Fields>
-PALPATE void act_blades(const Fields& given, Thread t, int) {
+PALPATE void act_blades(const Fields& f, Thread t, int) {
   if (t.tid > 0) return;
-  const Fields f = of_world(given, t.world);
   const bool ok = f.solve.status.data[3] == 0.0f;
   const D3 zero = {0.0, 0.0, 0.0};
   for (int i = 0; i < f.nblade; ++i) {
@@ -357,8 +341,7 @@ PALPATE void act_blades(const Fields& given, Thread t, int) {
 
 // Keeps the blades' state.
 template <class Fields>
-PALPATE void keep_blades(const Fields& given, Thread t, int) {
-  const Fields f = of_world(given, t.world);
+PALPATE void keep_blades(const Fields& f, Thread t, int) {
   each_item(t, BLADE_LENGTH * f.nblade, [&](int i) { f.state.data[i] = f.next.data[i]; });
 }
 

@@ -15,11 +15,7 @@ PALPATE double stretch2_of(const D3* rest, const D3* x) {
 
 // Finds the triangle of a world that is stretched most, and the square of its stretch; a warp has a world.
 template <class Fields>
-PALPATE void find_stretched(const Fields& given, Thread me, int) {
-  Fields f = given;
-  move_bodies(f.mj, me.world);
-  move_nodes(f.own, me.world);
-  move_to(f.elem, f.mesh.data[me.world]), move_to(f.flat, f.mesh.data[me.world]);
+PALPATE void find_stretched(const Fields& f, Thread me, int) {
   double least = NOWHERE;
   int worst = 0;
   D3 none = {0.0, 0.0, 0.0};
@@ -31,7 +27,7 @@ PALPATE void find_stretched(const Fields& given, Thread me, int) {
     if (under < least) least = under, worst = t;
   }
   agree(least, worst, none);
-  if (me.tid == 0) f.worst.data[me.world] = worst, f.square.data[me.world] = -least;
+  if (me.tid == 0) f.worst.data[0] = worst, f.square.data[0] = -least;
 }
 
 }  // namespace palpate

@@ -15,17 +15,6 @@ namespace palpate {
 // What an attachment leads to besides bodies.
 constexpr int TO_POINT = -1, TO_OWN_MOTION = -2;
 
-template <class Fields>
-PALPATE Fields of_world(Fields f, int world) {
-  const int row = f.row.data[world];
-  move_each(row, f.count, f.vert, f.body, f.leads, f.stiffness, f.anchor, f.whom, f.pair);
-  move_each(world, f.point, f.force, f.number, f.dvel_warm);
-  move_nodes(f.own, world);
-  move_input(f.solve, world);
-  move_bodies(f.mj, world);
-  return f;
-}
-
 struct Rigid { double R[9]; D3 middle, rest, vel, spin; };
 
 // Cofactors of a matrix row by row; returns its determinant.
@@ -129,12 +118,10 @@ PALPATE D3 point_of_body(const Fields& f, int n) {
 // Finds where the points on another organ are, which has number `which`.
 template <class Fields>
 PALPATE void aim_attachments(const Fields& all, Thread t, int which) {
-  const auto f = of_world(all.held, t.world);
-  auto other = all.other;
-  move_nodes(other, t.world);
+  const auto& f = all.held;
   each_item(t, f.count.data[0], [&](int n) {
     if (f.whom.data[n] != which) return;
-    const Place p = place_of(f.mj, other, f.pair.data[n]);
+    const Place p = place_of(f.mj, all.other, f.pair.data[n]);
     store(f.point.data + 6 * n, p.at + load(f.anchor.data + 3 * n));
     store(f.point.data + 6 * n + 3, p.vel);
   });
@@ -142,8 +129,7 @@ PALPATE void aim_attachments(const Fields& all, Thread t, int which) {
 
 // Adds to the solver's input what pulls at the attached nodes.
 template <class Fields>
-PALPATE void enter_attachments(const Fields& all, Thread t, int) {
-  const Fields f = of_world(all, t.world);
+PALPATE void enter_attachments(const Fields& f, Thread t, int) {
   const int count = f.count.data[0];
   const double h = f.mj.timestep.data[0], reach = f.ahead * h + f.number.data[DAMPING];
   const D3 zero = {0.0, 0.0, 0.0};
@@ -179,8 +165,7 @@ PALPATE void enter_attachments(const Fields& all, Thread t, int) {
 
 // Ends the forces with what the step makes of the nodes' velocities, and lets the bodies feel them.
 template <class Fields>
-PALPATE void act_attachments(const Fields& all, Thread t, int) {
-  const Fields f = of_world(all, t.world);
+PALPATE void act_attachments(const Fields& f, Thread t, int) {
   const auto& mj = f.mj;
   const bool ok = f.solve.status.data[3] == 0.0f;
   const double h = mj.timestep.data[0];

@@ -1,41 +1,11 @@
 // Bodies of MuJoCo that an organ holds, or that hold it, by forces of its own.
 //
-// A kernel begins with `of_world`, which moves what worlds have of their own to its world: MuJoCo's
-// doubles, of which there is one world, or mujoco_warp's floats.
+// Kernels get what their world has of its own: MuJoCo's doubles, of which there is one world, or
+// mujoco_warp's floats.
 #pragma once
 #include "coupling/node.h"
 
 namespace palpate {
-
-template <class Array>
-PALPATE void move_to(Array& a, int world) {
-  a.data += (size_t)world * ((size_t)a.strides[0] / sizeof(*a.data));
-}
-
-template <class... Arrays>
-PALPATE void move_each(int world, Arrays&... arrays) {
-  (move_to(arrays, world), ...);
-}
-
-template <class Arrays>
-PALPATE void move_bodies(Arrays& mj, int world) {
-  move_each(world, mj.ctrl, mj.xpos, mj.xmat, mj.cvel, mj.cdof, mj.qacc_warmstart, mj.subtree_com,
-            mj.geom_xpos, mj.geom_xmat, mj.qfrc_passive);
-}
-// Of an organ in the solver's own vectors, whose mesh is its world's; of one in MuJoCo's memory, of
-// which there is one.
-template <class Nodes>
-PALPATE auto move_nodes(Nodes& o, int world) -> decltype(*o.node.data, void()) {
-  if (!o.node.data) return;
-  move_each(world, o.disp, o.vel);
-  move_to(o.rest, o.mesh.data[world]);
-}
-template <class Nodes>
-PALPATE auto move_nodes(Nodes& o, int) -> decltype(*o.qposadr.data, void()) {}
-template <class Solve>
-PALPATE void move_input(Solve& s, int world) {
-  move_each(world, s.quiet, s.hold, s.force_ext, s.vel, s.dvel, s.status);
-}
 
 // A symmetric matrix, by its upper half.
 struct Sym { double xx, xy, xz, yy, yz, zz; };

@@ -22,19 +22,6 @@ constexpr int ON_ORGAN = -1;  // in place of a body
 struct Seat { D3 at, vel, x, y, z; };
 
 template <class Fields>
-PALPATE Fields of_world(Fields f, int world) {
-  const int row = f.row.data[world];
-  move_each(row, f.count, f.vert, f.slot, f.area, f.anchor, f.normal, f.corner, f.weight);
-  move_each(world, f.state, f.next, f.stretch, f.force, f.pull, f.hardness, f.number);
-  move_nodes(f.own, world);
-  move_nodes(f.other, world);
-  move_input(f.solve, world);
-  move_input(f.below, world);
-  move_bodies(f.mj, world);
-  return f;
-}
-
-template <class Fields>
 PALPATE Seat seat_on_body(const Fields& f, const Twist& moving) {
   const auto* R = f.mj.xmat.data + 9 * f.body;
   Seat s = {load(f.mj.xpos.data + 3 * f.body), {0.0, 0.0, 0.0}, {R[0], R[3], R[6]},
@@ -69,9 +56,8 @@ PALPATE double damage_of(const Fields& f, double opening) {
 
 // Finds the force of each bond on its vertex, what its spring weighs, and what damage it will have.
 template <class Fields>
-PALPATE void stretch_bonds(const Fields& all, Thread t, int) {
-  if (!all.live.data[0]) return;
-  const Fields f = of_world(all, t.world);
+PALPATE void stretch_bonds(const Fields& f, Thread t, int) {
+  if (!f.live.data[0]) return;
   const double h = f.mj.timestep.data[0], damping = f.number.data[DAMPING];
   const double reach = f.ahead * h + damping, twice = f.body == ON_ORGAN ? 2.0 : 1.0;
   const D3 zero = {0.0, 0.0, 0.0};
@@ -109,9 +95,8 @@ PALPATE Sym evenly(double weight) { return {weight, 0.0, 0.0, weight, 0.0, weigh
 
 // Adds the bonds' forces to the solver's input of their organ; it stays awake while one may pull.
 template <class Fields>
-PALPATE void enter_bonds(const Fields& all, Thread t, int) {
-  if (!all.live.data[0]) return;
-  const Fields f = of_world(all, t.world);
+PALPATE void enter_bonds(const Fields& f, Thread t, int) {
+  if (!f.live.data[0]) return;
   const D3 zero = {0.0, 0.0, 0.0};
   each_item(t, f.count.data[0], [&](int n) {
     const double weight = f.hardness.data[n];
@@ -125,9 +110,8 @@ PALPATE void enter_bonds(const Fields& all, Thread t, int) {
 // Adds them to the input of the organ that it is bonded to, one after the other: several may share a
 // vertex there.
 template <class Fields>
-PALPATE void bear_bonds(const Fields& all, Thread t, int) {
-  if (!all.live.data[0] || t.tid > 0) return;
-  const Fields f = of_world(all, t.world);
+PALPATE void bear_bonds(const Fields& f, Thread t, int) {
+  if (!f.live.data[0] || t.tid > 0) return;
   const D3 zero = {0.0, 0.0, 0.0};
   for (int n = 0; n < f.count.data[0]; ++n) {
     const double weight = f.hardness.data[n];
@@ -144,9 +128,8 @@ PALPATE void bear_bonds(const Fields& all, Thread t, int) {
 
 // Finds what the forces are with what the step made of the vertices' velocities.
 template <class Fields>
-PALPATE void act_bonds(const Fields& all, Thread t, int) {
-  if (!all.live.data[0]) return;
-  const Fields f = of_world(all, t.world);
+PALPATE void act_bonds(const Fields& f, Thread t, int) {
+  if (!f.live.data[0]) return;
   const bool ok = f.solve.status.data[3] == 0.0f;
   const double per_h = 1.0 / f.mj.timestep.data[0];
   each_item(t, f.count.data[0], [&](int n) {
@@ -161,9 +144,8 @@ PALPATE void act_bonds(const Fields& all, Thread t, int) {
 
 // Lets the body feel them.
 template <class Fields>
-PALPATE void feel_bonds(const Fields& all, Thread t, int) {
-  if (!all.live.data[0] || t.tid > 0) return;
-  const Fields f = of_world(all, t.world);
+PALPATE void feel_bonds(const Fields& f, Thread t, int) {
+  if (!f.live.data[0] || t.tid > 0) return;
   const D3 zero = {0.0, 0.0, 0.0};
   const Seat s = seat_on_body(f, Twist{zero, zero});
   D3 force = zero, torque = zero;
@@ -178,9 +160,8 @@ PALPATE void feel_bonds(const Fields& all, Thread t, int) {
 
 // Keeps the bonds' damage.
 template <class Fields>
-PALPATE void keep_bonds(const Fields& all, Thread t, int) {
-  if (!all.live.data[0]) return;
-  const Fields f = of_world(all, t.world);
+PALPATE void keep_bonds(const Fields& f, Thread t, int) {
+  if (!f.live.data[0]) return;
   each_item(t, f.count.data[0], [&](int n) {
     double* state = f.state.data + 2 * f.slot.data[n];
     const double* next = f.next.data + 2 * n;
@@ -194,8 +175,8 @@ PALPATE void keep_bonds(const Fields& all, Thread t, int) {
 // current, by what it gives in a step.
 template <class Fields>
 PALPATE void burn_bonds(const Fields& all, Thread t, int) {
-  if (!all.bonds.live.data[0] || t.tid > 0) return;
-  const auto f = of_world(all.bonds, t.world);
+  const auto& f = all.bonds;
+  if (!f.live.data[0] || t.tid > 0) return;
   const double given = fabs((double)f.mj.ctrl.data[all.actuator]) * f.mj.timestep.data[0];
   if (given == 0.0) return;
   const auto* R = f.mj.geom_xmat.data + 9 * all.geom;

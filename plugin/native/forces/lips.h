@@ -18,17 +18,6 @@ constexpr double SLACK = 1e-3;  // of `reach`, that lips overlap and do not touc
 
 struct Axes { D3 x, y, z; };
 
-template <class Fields>
-PALPATE Fields of_world(Fields f, int world) {
-  const int row = f.row.data[world];
-  move_each(row, f.count, f.vert, f.corner, f.normal, f.stiffness);
-  move_each(world, f.paired, f.pair_node, f.pair_hold);
-  move_nodes(f.own, world);
-  move_input(f.solve, world);
-  move_bodies(f.mj, world);
-  return f;
-}
-
 // From the first lip to the second, where a triangle of each of them has it now.
 template <class Fields>
 PALPATE D3 normal_of(const Fields& f, int n) {
@@ -48,8 +37,7 @@ PALPATE D3 normal_of(const Fields& f, int n) {
 
 // Adds the forces of what touches to the solver's input.
 template <class Fields>
-PALPATE void enter_lips(const Fields& all, Thread t, int) {
-  const Fields f = of_world(all, t.world);
+PALPATE void enter_lips(const Fields& f, Thread t, int) {
   const double h = f.mj.timestep.data[0];
   each_item(t, f.count.data[0], [&](int n) {
     const int *vert = f.vert.data + 2 * n, a = vert[0], b = vert[1];

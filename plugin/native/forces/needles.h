@@ -50,27 +50,6 @@ constexpr double MISSES = 0.7;  // of its way, that a hole does not follow where
 constexpr double TIGHT = 1e-9;  // of what tissue bears, to which a return mapping brings it
 constexpr double APART = 0.5;   // edges between holes in a solid, at least
 
-template <class Fields>
-PALPATE Fields of_world(Fields f, int world) {
-  move_bodies(f.mj, world);
-  move_nodes(f.own, world);
-  move_input(f.solve, world);
-  move_each(world, f.state, f.next, f.law, f.force, f.point, f.share, f.held, f.hold, f.feels, f.pull, f.torn, f.weight, f.lifted);
-  move_to(f.mj.M, world);
-  move_to(f.elem, f.mesh.data[world]), move_to(f.tet, f.mesh.data[world]);
-  move_to(f.flat, f.mesh.data[world]);
-  move_to(f.edges, f.edges.shape[0] > 1 ? world : 0);
-  return f;
-}
-
-// The same of a needle whose thread is held.
-template <class Fields>
-PALPATE Fields held_in_world(Fields f, int world) {
-  f.pierced = of_world(f.pierced, world);
-  move_each(world, f.first, f.tie_count, f.tie_edge, f.tie_value, f.span, f.moved);
-  return f;
-}
-
 // A needle where it is now.
 struct Arc {
   D3 at, x, y;
@@ -659,8 +638,7 @@ PALPATE int* lifted_edges(const Fields& f, int i) {
 // Says which these are, once all organs have told where they hold it: those between its first hole and its last one,
 // whichever organ has these. Between layers that lie on each other both would press on it.
 template <class Fields>
-PALPATE void lift_thread(const Fields& given, Thread t, int i) {
-  const Fields all = held_in_world(given, t.world);
+PALPATE void lift_thread(const Fields& all, Thread t, int i) {
   const auto& f = all.pierced;
   int* edges = lifted_edges(f, i);
   if (t.tid > 0 || !edges[1]) return;
@@ -673,8 +651,7 @@ PALPATE void lift_thread(const Fields& given, Thread t, int i) {
 
 // Takes the lengths of the edges of a thread whose nodes move along it.
 template <class Fields>
-PALPATE void measure_thread(const Fields& given, Thread t, int i) {
-  const Fields all = held_in_world(given, t.world);
+PALPATE void measure_thread(const Fields& all, Thread t, int i) {
   const auto thread = strand_of(all.pierced, i);
   each_item(t, thread.count - 1, [&](int e) {
     double* edge = all.pierced.edges.data + 2 * (thread.first + e);
@@ -686,8 +663,7 @@ PALPATE void measure_thread(const Fields& given, Thread t, int i) {
 
 // Says what holds a needle's thread, as the step begins: the points of the tissue where they will be.
 template <class Fields>
-PALPATE void aim_thread(const Fields& given, Thread t, int i) {
-  const Fields all = held_in_world(given, t.world);
+PALPATE void aim_thread(const Fields& all, Thread t, int i) {
   const auto& f = all.pierced;
   double s[NEEDLE_LENGTH];
   for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
@@ -725,8 +701,7 @@ PALPATE void aim_thread(const Fields& given, Thread t, int i) {
 
 // Takes the forces that the thread's step has found, in the order in which it was told what holds it.
 template <class Fields>
-PALPATE void feel_thread(const Fields& given, Thread t, int i) {
-  const Fields all = held_in_world(given, t.world);
+PALPATE void feel_thread(const Fields& all, Thread t, int i) {
   const auto& f = all.pierced;
   double s[NEEDLE_LENGTH];
   for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
@@ -748,8 +723,7 @@ PALPATE void feel_thread(const Fields& given, Thread t, int i) {
 }
 
 template <class Fields>
-PALPATE void enter_needles(const Fields& given, Thread t, int) {
-  const Fields f = of_world(given, t.world);
+PALPATE void enter_needles(const Fields& f, Thread t, int) {
   for (int i = 0; i < f.nneedle; ++i) {
     double s[NEEDLE_LENGTH];
     for (int c = 0; c < NEEDLE_LENGTH; ++c) s[c] = f.state.data[NEEDLE_LENGTH * i + c];
@@ -795,9 +769,8 @@ PALPATE void add_inertia(const Arrays& mj, int b, double along, double about) {
 
 // Ends the forces with what the step made of the tissue's velocities, and lets the needles feel them.
 template <class Fields>
-PALPATE void act_needles(const Fields& given, Thread t, int) {
+PALPATE void act_needles(const Fields& f, Thread t, int) {
   if (t.tid > 0) return;
-  const Fields f = of_world(given, t.world);
   const bool ok = f.solve.status.data[3] == 0.0f;
   const D3 zero = {0.0, 0.0, 0.0};
   const double h = f.mj.timestep.data[0];
@@ -830,30 +803,28 @@ PALPATE void act_needles(const Fields& given, Thread t, int) {
 
 // Keeps the needles' state.
 template <class Fields>
-PALPATE void keep_needles(const Fields& given, Thread t, int) {
-  const Fields f = of_world(given, t.world);
+PALPATE void keep_needles(const Fields& f, Thread t, int) {
   each_item(t, NEEDLE_LENGTH * f.nneedle, [&](int i) { f.state.data[i] = f.next.data[i]; });
 }
 
 // Tells what the needles of a batch do, a thread a world.
 template <class Fields>
-PALPATE void tell_needles(const Fields& all, Thread t, int) {
-  const auto f = of_world(all.pierced, t.world);
+PALPATE void tell_needles(const Fields& all, Thread, int) {
+  const auto& f = all.pierced;
   const auto& told = all.told;
   const double *R = f.own.frame.data, *origin = f.own.origin.data;
   for (int i = 0; i < f.nneedle; ++i) {
-    const int row = f.nneedle * t.world + i;
     double* s = f.state.data + NEEDLE_LENGTH * i;
     const double* force = f.force.data + 3 * POINTS * i;
     const Arc arc = arc_of(f, i);
     D3 sum = load(force + 3 * HOLES);
-    store(told.tip_force.data + 3 * row, turned(R, sum));
-    told.touches.data[row] = s[NEEDLE_STAGE] == TOUCHING;
-    told.inside.data[row] = s[NEEDLE_STAGE] == INSIDE;
-    told.energy.data[row] = (float)s[NEEDLE_WORK];
-    told.count.data[row] = (int)s[NEEDLE_COUNT];
+    store(told.tip_force.data + 3 * i, turned(R, sum));
+    told.touches.data[i] = s[NEEDLE_STAGE] == TOUCHING;
+    told.inside.data[i] = s[NEEDLE_STAGE] == INSIDE;
+    told.energy.data[i] = (float)s[NEEDLE_WORK];
+    told.count.data[i] = (int)s[NEEDLE_COUNT];
     for (int n = 0; n < (int)s[NEEDLE_COUNT]; ++n) {
-      const int at = HOLES * row + n;
+      const int at = HOLES * i + n;
       const Seat seat = seat_of_hole(f, s, n);
       D3 rest = {0.0, 0.0, 0.0};
       for (int c = 0; c < seat.count; ++c) rest += seat.share[c] * load(f.flat.data + 3 * seat.vert[c]);
@@ -866,7 +837,7 @@ PALPATE void tell_needles(const Fields& all, Thread t, int) {
       store(told.hole_force.data + 3 * at, turned(R, load(force + 3 * n)));
       sum += load(force + 3 * n);
     }
-    store(told.force.data + 3 * row, turned(R, sum));
+    store(told.force.data + 3 * i, turned(R, sum));
   }
 }
 

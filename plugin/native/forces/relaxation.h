@@ -13,13 +13,6 @@
 
 namespace palpate {
 
-template <class Fields>
-PALPATE Fields of_world(Fields f, int world) {
-  move_each(world, f.memory, f.quiet, f.hold, f.mass, f.force_ext, f.dvel, f.sol, f.rhs, f.status);
-  if (f.paired.data) move_each(world, f.paired, f.pair_node, f.pair_hold);
-  return f;
-}
-
 // What a step has besides f_new.
 template <class Fields>
 PALPATE D3 faded(const Fields& f, int i) {
@@ -30,8 +23,7 @@ PALPATE D3 faded(const Fields& f, int i) {
 
 // Adds it to the solver's input.
 template <class Fields>
-PALPATE void enter_relaxation(const Fields& all, Thread t, int) {
-  const Fields f = of_world(all, t.world);
+PALPATE void enter_relaxation(const Fields& f, Thread t, int) {
   f.quiet.data[0] = 0.0;
   each_item(t, f.nrelax, [&](int i) {
     float* ext = f.force_ext.data + offset_of(f.node.data[i]);
@@ -41,8 +33,7 @@ PALPATE void enter_relaxation(const Fields& all, Thread t, int) {
 
 // Takes f_new from what the step, and its answer to the contacts, made of the velocities.
 template <class Fields>
-PALPATE void end_relaxation(const Fields& all, Thread t, int) {
-  const Fields f = of_world(all, t.world);
+PALPATE void end_relaxation(const Fields& f, Thread t, int) {
   if (f.status.data[3] != 0.0f) return;
   const double per_h = 1.0 / f.mj.timestep.data[0];
   each_item(t, f.nrelax, [&](int i) {

@@ -15,20 +15,6 @@ namespace palpate {
 constexpr int ON_NOTHING = -1, ON_GEOM = -2;  // and below, by geoms; others are organs
 constexpr int CELLS = 1024;
 
-template <class Fields>
-PALPATE Fields of_world(Fields f, int world) {
-  const int row = f.row.data[world];
-  move_each(row, f.nouter, f.stiffness, f.cell, f.nother, f.elem, f.near_adr, f.near);
-  move_each(world, f.slip, f.slipped, f.on, f.force, f.hardness, f.corner, f.weight, f.where,
-            f.next, f.first);
-  move_nodes(f.own, world);
-  move_nodes(f.other, world);
-  move_input(f.solve, world);
-  move_input(f.below, world);
-  move_bodies(f.mj, world);
-  return f;
-}
-
 // n n^T times a, and the rest of the identity times b.
 PALPATE Sym along_and_across(D3 n, double a, double b) {
   const double c = a - b;
@@ -88,8 +74,7 @@ PALPATE void read_geom(const Fields& f, int g, double* geom) {
 
 // Finds what of the geoms each node rests on.
 template <class Fields>
-PALPATE void find_geoms(const Fields& all, Thread t, int) {
-  const Fields f = of_world(all, t.world);
+PALPATE void find_geoms(const Fields& f, Thread t, int) {
   each_item(t, f.nouter.data[0], [&](int i) { f.on.data[i] = ON_NOTHING; });
   for (int q = 0; q < f.ngeom; ++q) {
     const int g = f.geom.data[q], b = f.mj.geom_bodyid.data[g];
@@ -197,9 +182,8 @@ PALPATE Bounds sort_nodes(const Fields& f) {
 // Finds where nodes that rest on no geom rest on organ number `which`. Neither organ's step knows
 // what the other's changes: each has the spring twice in its matrix, which is stable for both.
 template <class Fields>
-PALPATE void find_organ(const Fields& all, Thread t, int which) {
+PALPATE void find_organ(const Fields& f, Thread t, int which) {
   if (t.tid > 0) return;
-  const Fields f = of_world(all, t.world);
   const Bounds near = sort_nodes(f);
   for (int i = 0; i < f.nouter.data[0]; ++i) {
     if (f.on.data[i] != ON_NOTHING || !f.free.data[i]) continue;
@@ -236,8 +220,7 @@ PALPATE Sym turned_back(const double* R, const Sym& m) {
 
 // Adds what an organ's nodes rest on to its solver's input.
 template <class Fields>
-PALPATE void press(const Fields& all, Thread t, int) {
-  const Fields f = of_world(all, t.world);
+PALPATE void press(const Fields& f, Thread t, int) {
   const D3 zero = {0, 0, 0};
   const double* R = f.own.frame.data;
   if (f.restless && t.tid == 0) f.solve.quiet.data[0] = 0.0;
@@ -250,8 +233,7 @@ PALPATE void press(const Fields& all, Thread t, int) {
 
 // Ends the forces of geoms with what the step made of the nodes' velocities.
 template <class Fields>
-PALPATE void act_supports(const Fields& all, Thread t, int) {
-  const Fields f = of_world(all, t.world);
+PALPATE void act_supports(const Fields& f, Thread t, int) {
   const double per_h = 1.0 / f.mj.timestep.data[0];
   each_item(t, f.nouter.data[0], [&](int i) {
     if (f.on.data[i] > ON_GEOM) return;
@@ -263,9 +245,8 @@ PALPATE void act_supports(const Fields& all, Thread t, int) {
 
 // Lets the geoms' bodies feel them.
 template <class Fields>
-PALPATE void feel_supports(const Fields& all, Thread t, int) {
+PALPATE void feel_supports(const Fields& f, Thread t, int) {
   if (t.tid > 0) return;
-  const Fields f = of_world(all, t.world);
   const D3 zero = {0, 0, 0};
   for (int q = 0; q < f.ngeom; ++q) {
     const int b = f.mj.geom_bodyid.data[f.geom.data[q]];
@@ -282,9 +263,8 @@ PALPATE void feel_supports(const Fields& all, Thread t, int) {
 
 // Adds what rests on an organ, which is number `which` of the one above, to its solver's input.
 template <class Fields>
-PALPATE void bear(const Fields& all, Thread t, int which) {
+PALPATE void bear(const Fields& f, Thread t, int which) {
   if (t.tid > 0) return;
-  const Fields f = of_world(all, t.world);
   const double* R = f.other.frame.data;
   f.below.quiet.data[0] = 0.0;
   for (int i = 0; i < f.nouter.data[0]; ++i) {
@@ -300,8 +280,7 @@ PALPATE void bear(const Fields& all, Thread t, int which) {
 
 // Keeps how far the nodes have slipped.
 template <class Fields>
-PALPATE void keep(const Fields& all, Thread t, int) {
-  const Fields f = of_world(all, t.world);
+PALPATE void keep(const Fields& f, Thread t, int) {
   const D3 zero = {0, 0, 0};
   each_item(t, f.nouter.data[0], [&](int i) {
     store(f.slip.data + 3 * i, f.on.data[i] == ON_NOTHING ? zero : load(f.slipped.data + 3 * i));

@@ -16,8 +16,8 @@ from ..geometry.mesh import Mesh, distinct
 from ..kernels import aim, kernel
 from ..order import addresses
 from ..step import OWN_SHARE
-from ..types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
-from .cut import Cut, Motion, Native, numbers
+from ..types import CONSTANTS, allocate, also, doubles, flags, ints, longs, struct
+from .cut import Cut, Cutting, Motion, Native, numbers
 from .cut_surface import sweep
 from .path import Finder
 
@@ -30,7 +30,15 @@ _MESH = ("rest", "tet", "ring", "degree")  # of `Mesh` and of `Cleaving`, what a
 _BY_TRIANGLE = ("elem", "of_tet")
 
 
+# What of these fields are those of `Cutting`.
+_OF_CUTTING = (
+  *("npath", "nint", "nreal", "given", "home", "mass", "disp", "vel", "pinned", "path"),
+  *("near", "group", "member", "share", "ints", "reals"),
+)
+
+
 @struct
+@also(Cutting, *_OF_CUTTING)
 class Cleaving:
   """What cuts of solids of one whole read and write; `Mesh` says what the first fields are."""
 
@@ -42,11 +50,8 @@ class Cleaving:
   most: int  # neighbours that a vertex has room for
   most_spare: int  # and those of a spare one
   most_elem: int  # triangles that there may be
-  nint: int  # whole numbers of scratch
-  nreal: int  # others
   nouter: int
   ntriangle: int  # triangles before the cut
-  npath: int
   nline: int
   closes: int
   energy: int  # whether moving vertices must not raise that of tetrahedra
@@ -54,7 +59,6 @@ class Cleaving:
   before: wp.float64  # see `sheet.Sheet.more` [m]
   after: wp.float64  # [m]
   foundation: wp.float64  # stiffness by area [N/m^3]
-  given: wp.float64  # by which the energy around a vertex may rise as it moves [J]
   rest: doubles("nvert", 3)
   tet: longs("ntet", 4)
   ring: longs("nvert", "most")
@@ -65,31 +69,19 @@ class Cleaving:
   whole_tet: longs("ntet", 4)
   whole_degree: longs("nvert")
   mate: longs("nface")
-  home: longs("nelem")
   begin: ints("nvert + 1")  # of the corners around each vertex of the whole
   around: ints("nface")  # these
   seat: ints("nvert")  # a corner that each vertex has, -1 for none
   triangle: ints("nface")  # the triangle that a face is, -1 for none
-  pinned: flags("nvert")  # whether a vertex does not move
-  mass: doubles("nvert")  # of vertices, before and after [kg]
-  disp: doubles("nvert", 3)  # displacement [m]
-  vel: doubles("nvert", 3)  # velocity [m/s]
   mu: doubles("ntet")  # of tetrahedra [Pa]
   lam: doubles("ntet")  # [Pa]
-  path: doubles("npath", 3)  # see `sheet.Sheet`
   begin_line: doubles("nline", 3)
   end_line: doubles("nline", 3)
   found: ints(len(_FOUND))  # see _FOUND
   size: doubles(len(_SIZE))  # see _SIZE
-  near: ints("nvert")  # see `Cut`, these and what follows
   changed: ints("ntet")
-  group: ints("nvert")
-  member: ints("nvert")
-  share: doubles("nvert")
   sat: ints("nvert")
   mouth: ints("nmouth", 2)  # edges of the skin that came apart, some of them twice
-  ints: ints("nint")  # scratch
-  reals: doubles("nreal")
 
 
 _CONSTANTS = CONSTANTS | numbers(FOUND=_FOUND, SIZE=_SIZE) | {"OWN_SHARE": OWN_SHARE}

@@ -8,16 +8,21 @@ from palpate.engine.model import mjstruct
 
 def test_views_are_the_arrays_of_the_bindings(scenes):
   model, data, _ = scenes.load(scenes.press())
-  m = mjstruct.Model.from_address(model._address)
-  d = mjstruct.Data.from_address(data._address)
+  m, d = mjstruct.both(model._address, data._address)
   assert (m.nv, m.nq, m.nflexvert) == (model.nv, model.nq, model.nflexvert)
   assert m.opt.timestep == model.opt.timestep
-  view = mjstruct.view(d.qpos, m.nq)
-  view[3] = 0.25
+  d.qpos[3] = 0.25
   assert data.qpos[3] == 0.25
-  np.testing.assert_array_equal(mjstruct.view(m.geom_size, (m.ngeom, 3)), model.geom_size)
+  for owner, own, names in (
+    (model, m, ("geom_size", "flex_rigid", "flex_solref", "skin_vert", "body_plugin")),
+    (data, d, ("qpos", "xmat", "ctrl", "geom_xpos")),
+  ):
+    for name in names:
+      theirs = getattr(owner, name)
+      np.testing.assert_array_equal(getattr(own, name), theirs)
+      assert getattr(own, name).shape == theirs.shape
   name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, 0)
-  assert mjstruct.name_of(m, m.name_flexadr, 0) == name
+  assert mjstruct.name_of(m, "flex", 0) == name
 
 
 def test_an_empty_or_absent_array_is_empty():
