@@ -113,8 +113,10 @@ CALLED bool list_near(const Fields& f, const double* x) {
 template <class Fields>
 PALPATE bool may_be_near(const Fields& f, const double* x, int i, int j, double far) {
   const D3 a = load(x + 3 * i) + load(x + 3 * i + 3), b = load(x + 3 * j) + load(x + 3 * j + 3);
+  const double d2 = dot(a - b, a - b), most = 2.0 * (far + STRETCHED * f.longest);
+  if (d2 >= most * most) return false;
   const double reach = 2.0 * far + STRETCHED * (f.length.data[i] + f.length.data[j]);
-  return dot(a - b, a - b) < reach * reach;
+  return d2 < reach * reach;
 }
 
 #if ON_CUDA
