@@ -65,7 +65,7 @@ class WorldRods:
 
 _CONSTANTS = rods.CONSTANTS | {"IS_CONTACT": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)}
 _begin, _end, _find_bad = (
-  kernel(name, "coupling/world_rods.h", WorldRods, _CONSTANTS)
+  kernel(name, "coupling/world_rods.h", WorldRods, _CONSTANTS, own=True)
   for name in ("begin_rods", "end_rods", "find_bad_rods")
 )
 

@@ -2,7 +2,6 @@
 // them as floats, and where these are others, as after a reset, they count.
 #pragma once
 #include "coupling/rod.h"
-#include "forces/bodies.h"
 
 AS_WRITTEN
 
@@ -10,8 +9,7 @@ namespace palpate {
 
 template <class Fields>
 struct WorldRod {
-  const Fields& f;  // moved to the world
-  const int world;
+  const Fields& f;  // what its world has of its own
   decltype(*Fields().rods.data) rod;
 
   PALPATE int own_dof(int dof) const { return f.own_dof.data[dof]; }
@@ -34,13 +32,8 @@ struct WorldRod {
   PALPATE double known(int dof) const {
     return f.qfrc_applied.data[dof] + f.qfrc_passive.data[dof] + f.qfrc_actuator.data[dof];
   }
-  PALPATE double damping(int dof) const {
-    return f.dof_damping.data[(size_t)(world % f.dof_damping.shape[0]) * f.nv + dof];
-  }
-  PALPATE double invweight(int body) const {
-    const auto& shape = f.body_invweight0.shape;
-    return ((const float*)f.body_invweight0.data)[2 * ((size_t)(world % shape[0]) * shape[1] + body)];
-  }
+  PALPATE double damping(int dof) const { return f.dof_damping.data[dof]; }
+  PALPATE double invweight(int body) const { return ((const float*)f.body_invweight0.data)[2 * body]; }
   PALPATE double last_acceleration(int dof) const { return f.qacc_warmstart.data[dof]; }
 
   PALPATE bool moves(int i) const { return f.dofadr.data[i] >= 0; }
@@ -134,35 +127,24 @@ struct WorldRod {
 };
 
 template <class Fields>
-PALPATE Fields of_world(Fields f, int world) {
-  move_each(world, f.now, f.speed, f.gravity, f.qpos, f.qvel, f.qfrc_applied,
-            f.xfrc_applied, f.qfrc_passive, f.qfrc_smooth, f.qfrc_actuator, f.qacc, f.qacc_warmstart, f.M, f.nefc, f.type,
-            f.id, f.J, f.J_rownnz, f.J_rowadr, f.J_colind, f.D, f.aref, f.force);
-  return f;
+PALPATE void begin_rods(const Fields& f, Thread, int) {
+  begin(WorldRod<Fields>{f, f.rods.data[0]}, f.timestep);
 }
 
 template <class Fields>
-PALPATE void begin_rods(const Fields& f, Thread t, int) {
-  const Fields here = of_world(f, t.world);
-  begin(WorldRod<Fields>{here, t.world, f.rods.data[t.world]}, f.timestep);
-}
-
-template <class Fields>
-PALPATE void end_rods(const Fields& f, Thread t, int) {
-  const Fields here = of_world(f, t.world);
-  end(WorldRod<Fields>{here, t.world, f.rods.data[t.world]}, f.timestep);
-  if (f.rods.data[t.world].status.data[0] < 0) f.bad.data[t.world] = 1;
+PALPATE void end_rods(const Fields& f, Thread, int) {
+  end(WorldRod<Fields>{f, f.rods.data[0]}, f.timestep);
+  if (f.rods.data[0].status.data[0] < 0) f.bad.data[0] = 1;
 }
 
 // Flags the worlds with numbers that are not finite, or huge.
 template <class Fields>
 PALPATE void find_bad_rods(const Fields& f, Thread t, int) {
-  const Fields here = of_world(f, t.world);
   bool bad = false;
-  each_item(t, 3 * f.rods.data[t.world].nnode, [&](int a) {
-    bad = bad || !(fabs(here.now.data[a]) < 1e6 && fabs(here.speed.data[a]) < 1e6);
+  each_item(t, 3 * f.rods.data[0].nnode, [&](int a) {
+    bad = bad || !(fabs(f.now.data[a]) < 1e6 && fabs(f.speed.data[a]) < 1e6);
   });
-  if (bad) f.bad.data[t.world] = 1;
+  if (bad) f.bad.data[0] = 1;
 }
 
 }  // namespace palpate
