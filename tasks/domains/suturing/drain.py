@@ -200,10 +200,11 @@ def pull_test(s, o):
   Returns:
     o; SUCCESS once the knot has held, MISSED once it has not, and RUNNING until then
   """
-  if o.gap < GAPE:
+  parted = o.broken or not o.whole
+  if o.gap < GAPE and not parted:
     o.security = o.pulled
   gapes = o.left > CLOSED and o.free > _LET_GO - 1e-6
-  if gapes or o.gap > GAPE or o.pulled == _LAST:
+  if gapes or parted or o.gap > GAPE or o.pulled == _LAST:
     return o, SUCCESS if o.security > PULL - 1e-6 else MISSED
   o.free = o.free + o.control_timestep
   o.pulled = clamp(_RISES * (o.free - _LET_GO), 0.0, _LAST)
@@ -233,7 +234,8 @@ class Sewn(Task):
   A knot of several throws is tested: its strands are let go, and the wall on both sides of the
   stitch is lifted and pulled apart, harder and harder to 2 N. It holds where the slit is closed to
   1 mm when the strands are let go, and gapes less than unsewn, 2.4 mm, up to a pull of 0.6 N, with
-  which its strands were drawn. The pull at which it gapes so is its security.
+  which its strands were drawn. The pull at which it gapes so, or the thread breaks or is torn out,
+  is its security.
 
   Attributes:
     turns: how often the strands wind about each other in each throw

@@ -153,7 +153,7 @@ class Extracorporeal(drain.Sewn):
   def advance(self, physics: Physics) -> float:
     """Follows the throw down; see the module's head."""
     self.look(physics)
-    if self.lost(physics):
+    if self.seated < self.throws and self.lost(physics):
       return -1.0
     high = float(self.throw[2] - self.stitch[2])
     waits = self.laid == self.seated

@@ -220,11 +220,11 @@ def is_down(o):
 
 def judge(s, o):
   """Returns the progress of the knot; see the module's head."""
-  if o.broken or not o.whole:
-    return o, -1.0, DAMAGED
   if o.seated == o.throws:
     o, outcome = pull_test(s, o)
     return o, 0.95, outcome
+  if o.broken or not o.whole:
+    return o, -1.0, DAMAGED
   o.stayed = o.stayed + o.control_timestep if is_down(o) else 0.0
   closing = clamp((GAPE - o.gap) / (GAPE - CLOSED), 0.0, 1.0)
   before = 2.0 * (o.tied - 1.0)
