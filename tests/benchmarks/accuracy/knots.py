@@ -217,9 +217,18 @@ def finding(rows: list[Row]) -> list[str]:
   return lines
 
 
+def label(row: Row) -> str:
+  """Returns how long edges are."""
+  return f"{row['segment']:g}" if row["kind"] == "edge" else row["knot"]
+
+
 def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   """Writes the page."""
   kinds = "tangle", "pull", "edge", "long", "stitch"
+  # Processes end in any order.
+  cases = [case["case"] for stage in stages(argparse.Namespace(short=False)) for case in stage]
+  order = {case: k for k, case in enumerate(cases)}
+  rows = sorted(rows, key=lambda r: order.get(r["case"], len(order)))
   by = {kind: [r for r in rows if r["kind"] == kind] for kind in kinds}
   pulls = [
     [r["knot"], r["material"], f"{r['friction'] or '-'}", f"{r['held']:.2f}", f"{r['slip_mm']:.1f}",
@@ -228,8 +237,8 @@ def report(rows: list[Row], path: pathlib.Path) -> results.Page:
   ]  # fmt: skip
   edges, lengths = (
     [
-      [f"{r['segment']:g}" if r["kind"] == "edge" else r["knot"], str(r["nodes"]),
-       f"{r['kept_mm']:.2f}", f"{r['median_ms']:.2f}", f"{r['high_ms']:.1f}"]
+      [label(r), str(r["nodes"]), f"{r['kept_mm']:.2f}", f"{r['median_ms']:.2f}",
+       f"{r['high_ms']:.1f}"]
       for r in by[kind]
     ]
     for kind in ("edge", "long")
@@ -259,9 +268,8 @@ def report(rows: list[Row], path: pathlib.Path) -> results.Page:
     results.link(path),
   ]
   panels: dict = {
-    "overhand knot": {
-      f"{r['segment']:g} radii": ([r["median_ms"]], [r["kept_mm"]]) for r in by["edge"]
-    }
+    name: {label(r): ([r["median_ms"]], [r["kept_mm"]]) for r in by[kind]}
+    for name, kind in (("by edges [radii]", "edge"), ("15 cm, by edges [radii]", "long"))
   }
   title = "Thread kept in an overhand knot, by the time of a step"
   picture = plots.curves(path.with_suffix(".png"), title, panels, "median step [ms]", "kept [mm]")
