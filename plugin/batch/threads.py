@@ -243,10 +243,8 @@ class _Tissue(Tissue):
   def push(self, world: int):
     """Applies the forces of a world."""
     if self.forced:
-      model, flex = self.batch.models[world], self.space.organ.flex
-      first = model.flex_vertadr[flex]
-      body = model.flex_vertbodyid[first : first + self.nvert]
-      self.batch.datas[world].xfrc_applied[body, :3] = self.applied.numpy()[world]
+      force = self.batch.datas[world].xfrc_applied
+      force[self.space.organ.body, :3] = self.applied.numpy()[world]
 
   @functools.cached_property
   def bonds(self) -> OfThreads:

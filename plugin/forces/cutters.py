@@ -185,17 +185,13 @@ class Cutters(Force):
     host, n = self.host, len(self.names)
     values: dict[str, Any] = {name: host.zeros(n, width) for name, width in _WIDTHS.items()}
     law = self._law(host.config.thickness)
-    values |= (
-      self.geoms
-      | host.surface()
-      | dict(
-        nblade=n,
-        edge=float(host.organ.mesh.whole.edge_length),
-        law=np.tile(law, (host.nworld, 1, 1)),
-        state=host.rows("blade", len(BLADE)),
-        held=host.zeros(n, _HELD, dtype=int),
-        due=host.zeros(n, dtype=int),
-      )
+    values |= self.geoms | host.surface() | dict(
+      nblade=n,
+      edge=float(host.organ.mesh.whole.edge_length),
+      law=np.tile(law, (host.nworld, 1, 1)),
+      state=host.rows("blade", len(BLADE)),
+      held=host.zeros(n, _HELD, dtype=int),
+      due=host.zeros(n, dtype=int),
     )
     self.fields = host.fill(Blades, values, into=self.fields)
     self._due = self.fields.due.numpy()[0].data if host.alone else None
