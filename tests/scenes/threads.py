@@ -12,11 +12,20 @@ from palpate.tissue.sutures import DIAMETER, SUTURES
 RADIUS, YOUNG, DENSITY = 1.125e-4, 8.7e9, 1330.0  # silk 3-0
 
 
+def lengths(curve):
+  """Returns the length of a curve up to each of its points [m]."""
+  return np.r_[0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
+
+
+def points_at(curve, along):
+  """Returns the points of a curve that are so far along it [m]."""
+  return np.stack([np.interp(along, lengths(curve), c) for c in curve.T], axis=1)
+
+
 def resampled(curve, segment):
   """Returns points along a curve, `segment` apart [m]."""
-  along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
-  at = np.linspace(0, along[-1], int(along[-1] / segment) + 1)
-  return np.stack([np.interp(at, along, c) for c in curve.T], axis=1)
+  whole = lengths(curve)[-1]
+  return points_at(curve, np.linspace(0, whole, int(whole / segment) + 1))
 
 
 def with_tails(curve, tail):
@@ -36,14 +45,12 @@ def overhand(size, segment, tail):
 
 def graded(curve, fine, coarse, half, growth=1.15):
   """Returns points along a curve, `fine` apart within `half` of its middle, then up to `coarse`."""
-  along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
-  middle, at, edge = 0.5 * along[-1], [0.0], fine
+  middle, at, edge = 0.5 * lengths(curve)[-1], [0.0], fine
   while at[-1] < middle:
     edge = min(coarse, edge * growth) if at[-1] > half else edge
     at.append(at[-1] + edge)
   at = np.array(at) * middle / at[-1]
-  at = middle + np.r_[-at[:0:-1], at]
-  return np.stack([np.interp(at, along, c) for c in curve.T], axis=1)
+  return points_at(curve, middle + np.r_[-at[:0:-1], at])
 
 
 def tangle(seed, segment):
@@ -221,22 +228,58 @@ def throws(turns, radius, segment, ear=5e-3, arm=5e-3):
 
 def masses(thread):
   """Returns the mass of each node of a thread with `refine` [kg], which goes by its length."""
-  half = 0.5 * thread.rest_lengths
-  return thread.model.body("t_0").mass[0] * (np.append(half, 0) + np.append(0, half)) * (
-    len(half) + 1
-  ) / (2 * half.sum())
+  length = thread.rest_lengths
+  own = np.append(length, 0) + np.append(0, length)
+  return thread.model.body("t_0").mass[0] * own / own.mean()
 
 
-def drawn(turns, force=2.0, steps=240):
-  """Returns the nodes of a knot that all four strands have drawn tight, see `throws` [m]."""
-  points, first, last = throws(turns, RADIUS, 2.5 * RADIUS)
+def in_four_hands(turns, material="silk", size="3-0", segment=2.5, **config):
+  """Returns model, data and a thread with loose `throws`, whose four strands are in hands."""
+  radius = 0.5 * DIAMETER[size]
+  points, first, last = throws(turns, radius, segment * radius)
   nodes = first, last, 0, len(points) - 1
   hands = [(node, (np.sign(points[node, 0]), 0, 0)) for node in nodes]
-  model, data, thread = load(points, hands, damping=20.0, material="silk", size="3-0", strength=0)
+  return load(points, hands, damping=20.0, material=material, size=size, strength=0, **config)
+
+
+def set_knot(model, data, force, steps, step=mujoco.mj_step):
+  """Draws all four strands, harder and harder for 200 steps."""
   for k in range(steps):
     data.ctrl[:] = force * min(1.0, k / 200)
-    mujoco.mj_step(model, data)
+    step(model, data)
+
+
+def drawn(turns):
+  """Returns the nodes of a knot that all four strands have drawn tight by 2 N [m]."""
+  model, data, thread = in_four_hands(turns)
+  set_knot(model, data, 2.0, 240)
   return thread.positions
+
+
+def pull_ends(model, data, thread, axis, steps, mass):
+  """Pulls the ends of a thread apart, up to 0.5 N after 50 steps.
+
+  Args:
+    model: with the thread alone
+    data: its state
+    thread: which
+    axis: way of the last end
+    steps: how many
+    mass: function of the thread to the mass of its nodes, or of each [kg]
+
+  Returns:
+    its energy after each step, and by how much more than the work of the pull it grew [J]
+  """
+  energies, works = [], []
+  for k in range(steps):
+    pull = 0.5 * min(1.0, k / 50) * axis
+    data.qfrc_applied[:3], data.qfrc_applied[-3:] = -pull, pull
+    before = data.qpos.copy()
+    mujoco.mj_step(model, data)
+    works.append(data.qfrc_applied @ (data.qpos - before))
+    square = (data.qvel.reshape(-1, 3) ** 2).sum(axis=1)
+    energies.append(thread.energy + 0.5 * (mass(thread) * square).sum())
+  return np.array(energies), np.diff(energies) - works[1:]
 
 
 def with_loose_tails(points, random, step=3e-4):
@@ -303,17 +346,10 @@ def pull_test(
   Returns:
     what held [N], a share of the strength; how far the strands came out of the knot [m]; the thread
   """
-  radius, strength = 0.5 * DIAMETER[size], SUTURES[material].strength[size]
-  points, first, last = throws(turns, radius, segment * radius)
-  nodes = first, last, 0, len(points) - 1
-  hands = [(node, (np.sign(points[node, 0]), 0, 0)) for node in nodes]
-  model, data, thread = load(
-    points, hands, damping=20.0, material=material, size=size, strength=0, **config
-  )
+  strength = SUTURES[material].strength[size]
+  model, data, thread = in_four_hands(turns, material, size, segment, **config)
   at = [model.joint(f"hand_{k}").qposadr[0] for k in (0, 1)]
-  for k in range(300):
-    data.ctrl[:] = set_by * min(1.0, k / 200)
-    step(model, data)
+  set_knot(model, data, set_by, 300, step)
   for k in range(100):
     data.ctrl[2:] = set_by * (1 - k / 100)
     step(model, data)

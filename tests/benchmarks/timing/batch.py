@@ -146,7 +146,8 @@ def measure(
   made, rms = time.perf_counter() - start, float("nan")
   steps = STEPS
   if begin:
-    steps, thread = FEW, len(next(iter(batch.threads.values())).xpos.numpy()[0])
+    (own,) = batch.threads.values()
+    steps, thread = FEW, own.xpos.shape[1]
     begin(batch)
     batch.step(FEW)
     begin(batch)
