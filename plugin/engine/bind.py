@@ -12,7 +12,7 @@ from palpate.tissue.body import Body
 
 from . import contacts, coupling, graphs, nodal, penetration
 from .coupling import Phases
-from .model import declare, mjstruct
+from .model import declare, mjstruct, shared
 from .windows import declare_windows, nodes, proxies, windowed
 
 if TYPE_CHECKING:
@@ -36,7 +36,10 @@ def bind(w: Workspace, model: int):
     else:
       does = nodal.Phases(w.host, w.share)
     w.graphs.phases, w.graphs.resident = does, does.resident
-    w.cuts.bind(model, w.plugin_state)
+    if w.organ.windows or w.cuts:
+      w.triangles = shared.of(model, w.data)
+      w.triangles.join(model)
+      w.cuts.bind(model, w.triangles, w.plugin_state)
     near = wp.get_device(does.side)
     crossing = device != near
 
@@ -76,8 +79,8 @@ def bind(w: Workspace, model: int):
       ahead = graphs.record_all((near, does.enter_ahead), (device, solve))
       w.graphs.resident.begin_graph = ahead[0][1]
       w.graphs.resident.rest = graphs.record_all((near, does.look_ahead))
-    if w.turn is not None:
-      w.turn.bind(model, w.organ.window)
+    if w.turn is not None and w.triangles:
+      w.turn.bind(model, w.triangles, w.organ.window)
   _watch(w, model)
 
 

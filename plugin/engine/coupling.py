@@ -24,7 +24,7 @@ from palpate.tissue.types import DIMS, Array, State, System, also, lent, struct
 
 from . import layout
 from .layout import NodalState, WindowState
-from .model import mjstruct
+from .model import mjstruct, shared
 
 if TYPE_CHECKING:
   from .model.declare import Declaration
@@ -181,10 +181,13 @@ def wrap(address: int, shape: Any, dtype: type = wp.float64) -> wp.array:
 def mujoco_arrays(model: int, data: int, kind: Any = Mujoco):
   """Returns `Mujoco`, or what has MuJoCo's names in another struct, for an mjModel and mjData."""
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
+  triangles = shared.of(model, data).elem
   option, start = type(m.opt), model + mjstruct.Model.opt.offset
   out = kind()
   for name, dims in DIMS[kind.key].items():
-    if hasattr(option, name):
+    if name == "flex_elem":
+      address = triangles.ctypes.data
+    elif hasattr(option, name):
       address = start + getattr(option, name).offset
     elif hasattr(m, name) or hasattr(d, name):
       address = getattr(m if hasattr(m, name) else d, name)

@@ -18,7 +18,7 @@ from . import change, contacts, coupling, rods, signals, workspace
 from .bind import bind
 from .cutting import cuts
 from .layout import FLAG
-from .model import declare, mjstruct, skin, state_size
+from .model import declare, mjstruct, shared, skin, state_size
 from .model.mjstruct import NAME, warn
 from .windows import windowed
 from .workspace import Workspace
@@ -140,6 +140,7 @@ def _destroy(data: int, instance: int):
   w = _workspaces.pop((data, instance), None)
   contacts.forget(data)
   coupling.forget(data)
+  shared.forget(data)
   for state in [s for s, other in _states.items() if other is w]:
     del _states[state]
 
@@ -245,8 +246,7 @@ def _visualize(model: int, data: int, option: int, scene: int, instance: int):
 def _draw(w: Workspace, model: int, data: int):
   if w.cuts:
     cuts.follow(w)
-    with w.cuts.lock:
-      w.cuts.show()
+    w.cuts.show(drawn=True)
   if w.organ.windows:
     windowed.draw(w, model, data)
   if w.cuts:

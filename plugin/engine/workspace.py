@@ -28,11 +28,10 @@ from .cutting import cuts
 from .cutting.cuts import Cuts
 from .host import Host
 from .layout import FLAG, HEAD, Topology
-from .model import declare, flexes, inertia, mjstruct, prepare, skin
+from .model import declare, flexes, inertia, mjstruct, prepare, shared, skin
 from .model.declare import Declaration
 from .penetration import Watch
 from .windows import declare_windows, windowed
-from .windows.model_lock import Turn
 from .windows.resident import Resident
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
@@ -145,6 +144,7 @@ class Workspace:
     forces: what acts on the organ beside its tissue
     cuts: its mesh as it is now
     opens: forces that let it come apart
+    triangles: those of the mjData where this organ changes them, or None
     turn: this mjData's part in the model's window, or None
     skin: what is drawn for it, or None
     views: what a coupling keeps when its graphs are recorded anew
@@ -157,7 +157,8 @@ class Workspace:
   forces: Forces = dataclasses.field(init=False)
   cuts: Cuts = dataclasses.field(init=False)
   opens: tuple[Tears, Cutters] = dataclasses.field(init=False)
-  turn: Turn | None = None
+  triangles: shared.Triangles | None = None
+  turn: shared.Turn | None = None
   skin: skin.Skin | None = None
   views: dict = dataclasses.field(default_factory=dict)
 
@@ -238,6 +239,8 @@ class Workspace:
       self.report.strange = False
     cuts.follow(self)
     changed = self.cuts.renewed()
+    if self.triangles:
+      self.triangles.enter()
     if self.turn is None:
       if self.cuts:
         self._run_cut(changed)
@@ -250,12 +253,10 @@ class Workspace:
         self._run()
 
   def _run_cut(self, changed: bool):
-    """Runs an organ that may be cut: the model's triangles must be its own."""
-    with self.cuts.lock:
-      others = self.cuts.show()
-      if changed or others:
-        windowed.find_contacts_again(self)
-      self._run()
+    """Runs an organ that may be cut: contacts must be with its own triangles."""
+    if self.cuts.show() or changed:
+      windowed.find_contacts_again(self)
+    self._run()
 
   def _run(self):
     self.needles.lead()
@@ -299,7 +300,7 @@ class Workspace:
       if place.tobytes() != was:
         declare.check_frame(mjstruct.model(self.model), self.organ)
 
-  def _is_astray(self, turn: Turn) -> bool:
+  def _is_astray(self, turn: shared.Turn) -> bool:
     """Returns whether qpos was set without the plugin state: slots are not on their nodes."""
     if turn.qpos.tobytes() == turn.stood:
       return False
@@ -450,7 +451,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     host = Host(organ, body, data, model, instance)
     w = Workspace(host, Seen(instance), Report(host.flags().numpy().data))
     if organ.windows:
-      w.turn = Turn()
+      w.turn = shared.Turn()
     _view(w)
     prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.

@@ -5,7 +5,7 @@ of them; of a solid the faces that are open, and a corner of each vertex that cu
 `tissue.cutting.facets`). Where the stamp is not that of the arrays, a state came from outside (or a
 reset, a copy), and what differs is written into them. MuJoCo's own list of triangles is in the
 mjModel; it has a stamp too, and a number that each writing changes, so that several mjData of one
-model take turns.
+model take turns (see `model.shared`).
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from palpate.tissue.geometry.mesh import Mesh
 
 from ...forces import passive
 from .. import coupling
-from ..model import flexes, mjstruct
-from ..windows import model_lock
+from ..model import flexes, mjstruct, shared
 from .trails import Current
 from .walls import Walls
 
@@ -53,11 +52,9 @@ class Cuts:
     declared: the organ before the first cut
     world: its mesh as it is now, with masses
     reports: what cuts did since the state was set
-    lock: held while the model's triangles are read or written
   """
 
   world: World
-  lock: Any = None
 
   def __init__(self, organ: Declaration, body: Body, model: int):
     self.declared, self.whole, self._body = organ, organ.mesh, body
@@ -82,8 +79,8 @@ class Cuts:
     """The mesh as it is now."""
     return self.world.mesh
 
-  def bind(self, model: int, state: np.ndarray):
-    """Takes views of a model, and of the plugin state."""
+  def bind(self, model: int, triangles: shared.Triangles, state: np.ndarray):
+    """Takes views of a model, of an mjData's triangles, and of its plugin state."""
     if not self:
       return
     m, organ = mjstruct.model(model), self.declared
@@ -91,8 +88,11 @@ class Cuts:
     self._own = {name: state[where[name]] for name in BLOCKS}
     self._words = state[where["corner"].start : where["weight"].stop]
     self._found: Any = self._own["stamp"].data
-    self.lock = model_lock.lock_of(model)
-    self._elem = flexes.element_data(m, organ.flex)
+    self._triangles = triangles
+    self._theirs = flexes.element_data(m, organ.flex)
+    first = int(m.flex_elemdataadr[organ.flex])
+    self._elem = triangles.elem[first:][: self._theirs.size].reshape(self._theirs.shape)
+    self._elem[:] = self.mesh.elem[: self.whole.nelem]
     self._border = np.flatnonzero(self.whole.twin < 0)
     self._rim = flexes.rim_data(m, organ.flex, len(self._border))
     self._marks = flexes.marks(m, organ.flex)
@@ -154,6 +154,7 @@ class Cuts:
     if other.any():
       touched = topology.distinct(touched, np.flatnonzero(other))
     self._refill.write(world.mesh, changed, config, ~self.declared.free)
+    self._elem[:] = world.mesh.elem[: self.whole.nelem]
     bodies.occupy(self._body, world.mesh)
     self.world = world
     return touched
@@ -169,17 +170,21 @@ class Cuts:
 
   # MuJoCo's triangles.
 
-  def show(self) -> bool:
-    """Gives the model the triangles of this organ; returns whether it has had others meanwhile.
+  def show(self, drawn: bool = False) -> bool:
+    """Gives the model the triangles of this organ, where it may or they are to be drawn.
 
-    The caller holds `lock`. What other mjData wrote may be like these again, but not all along.
+    Returns:
+      whether it has had others meanwhile: other mjData may have written these again
     """
     own = self._stamp or _UNCUT
-    if self._marks[0] != own:
-      self._elem[:] = self.mesh.elem[: self.whole.nelem]
-      self._rim[:] = np.stack([topology.corners(self.mesh, self._border, k) for k in (0, 1)], 1)
-      self._marks[:] = own, model_lock.new_mark()
-    was, self._seen = self._seen, float(self._marks[1])
+    with self._triangles.lock:
+      if self._marks[0] != own:
+        if not (drawn or self._triangles.alone):
+          return True
+        self._theirs[:] = self._elem
+        self._rim[:] = np.stack([topology.corners(self.mesh, self._border, k) for k in (0, 1)], 1)
+        self._marks[:] = own, shared.new_mark()
+      was, self._seen = self._seen, float(self._marks[1])
     return was != self._seen
 
   def draw(self, organ: Declaration, disp: np.ndarray, model: int, data: int):
@@ -303,6 +308,5 @@ def _take(w: Workspace, found: Cut) -> Report:
     changed = topology.distinct(found.near, member)
     w.graphs.phases.carry(changed, motion.disp, motion.vel, group, member, share)
     if not w.organ.windows:  # of which MuJoCo reads triangles only where they are drawn
-      with w.cuts.lock:
-        w.cuts.show()
+      w.cuts.show()
   return report

@@ -285,7 +285,8 @@ def find_contacts_again(w: Workspace):
   row = np.repeat(other, m.M_rownnz)
   kept = [(d.M, row), (d.qLD, row), (d.qLDiagInv, other)]
   values = [array[which].copy() for array, which in kept]
-  safe_calls.find_contacts(w.model, w.data)
+  assert w.triangles  # else nothing changes the triangles
+  safe_calls.find_contacts(w.triangles.model(w.model), w.data)
   for (array, which), were in zip(kept, values, strict=True):
     array[which] = were
   coupling.again(w.data, w.seen.instance)

@@ -57,6 +57,33 @@ def test_threads_that_cut_and_step_one_nodal_model_do_not_disturb_each_other():
       assert found[k][1] == alone[k][1]
 
 
+@pytest.mark.parametrize("windows", [False, True], ids=["nodal", "windows"])
+def test_no_thread_changes_triangles_that_another_may_be_reading(windows):
+  model = scene(windows)
+
+  def go(model, angle):
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 40)
+    palpate.Organ(model, data, "organ").cut(arc(angle))
+    mujoco.mj_step(model, data, 40)
+    datas.append(data)
+    return data
+
+  datas: list = []
+  whole = model.flex_elem.copy()
+  go(model, 0.0)
+  one = model.flex_elem.copy()
+  assert (one != whole).any()
+  thread = threading.Thread(target=go, args=(model, 0.7))
+  thread.start()
+  thread.join()
+  np.testing.assert_array_equal(model.flex_elem, one)
+  alone = go(copy.copy(model), 0.7)
+  np.testing.assert_array_equal(datas[1].qpos, alone.qpos)
+  assert datas[1].ncon == alone.ncon > 0
+  np.testing.assert_array_equal(datas[1].contact.elem, alone.contact.elem)
+
+
 @pytest.mark.parametrize("elements", ["membrane", "solid"])
 @pytest.mark.parametrize("windows", [False, True], ids=["nodal", "windows"])
 def test_set_const_leaves_a_cut_model_what_it_was(windows, elements):
