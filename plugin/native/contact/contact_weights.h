@@ -92,7 +92,7 @@ PALPATE bool is_threads(const Fields& f, const char* contact) {
 template <class Fields>
 PALPATE void weigh_side(const Fields& f, char* contact, Rows rows, int side) {
   const int flex = side_of(contact, CONTACT_FLEX, side), elem = side_of(contact, CONTACT_ELEM, side);
-  if (flex < 0 || elem < 0 || !f.mine.data[flex]) return;
+  if (flex < 0 || elem < 0 || !f.mine.data[flex] || f.flex_dim.data[flex] != 2) return;
   const int start = f.flex_vertadr.data[flex], other = side_of(contact, CONTACT_VERT, 1 - side);
   const int* e = f.flex_elem.data + f.flex_elemdataadr.data[flex] + 3 * elem;
   D3 x[3];
