@@ -56,7 +56,7 @@ def add_thread(
     bead: radius of a bead at the last node, such as a clip or a knot, which has no contacts but
       does not pass a narrower hole of a needle; 0 for none [m]
     **config: keys of a rod, some of which replace the material's: young, poisson, bend, twist,
-      strength, drag, refine
+      strength, yield_strain, drag, refine
 
   Returns:
     The flex, for instance to give it a material.
@@ -159,7 +159,7 @@ class Thread:
       points: of the line, from the first of the nodes on, in the world [m]; beyond them the
         thread continues straight                                      (n, 3)
       nodes: consecutive nodes along the line, up to an end of the thread; the others stay. None
-        for all nodes, which also resets twist and breaks
+        for all nodes, which also resets twist and breaks; bends that it has kept are lost
       tension: of these edges [N]
 
     Raises:
@@ -173,6 +173,7 @@ class Thread:
       raise ValueError(f"thread {self.name!r}: nodes is {nodes}, expected consecutive ones")
     if nodes is None:
       self._space.plugin_state[:] = 0.0
+    self._own_rest()[which] = 0.0
     edge, measured = np.minimum(which[1:], which[:-1]), self._space.measured()
     length = measured["length"][edge] + tension / measured["stretch"][edge]
     last = line[-1] - line[-2]
@@ -244,9 +245,22 @@ class Thread:
     return self._space.own.twist.numpy().copy()
 
   @property
+  def rest_curvature(self) -> np.ndarray:
+    """Bend that each node has kept, as the key `yield_strain` lets it, (nnode, 3).
+
+    Along the axis of the bend, in the axes of the parent body, its length 2 tan(angle / 2).
+    """
+    return self._own_rest().copy()
+
+  def _own_rest(self) -> np.ndarray:
+    kept = self._space.own.rest_curvature.numpy()
+    return kept.reshape(-1, 3) if len(kept) else np.zeros((len(self._space.organ.rest), 3))
+
+  @property
   def energy(self) -> float:
     """Elastic energy [J]."""
-    return rod.energy(self._space.measured(), self._local(), self.twist, self.broken)
+    own = self.twist, self._own_rest(), self.broken
+    return rod.energy(self._space.measured(), self._local(), *own)
 
   @property
   def broken(self) -> np.ndarray:

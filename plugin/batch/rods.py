@@ -116,7 +116,7 @@ class Thread(thread.Thread):
     self.iterations = each["status"]
     each |= self.ties.arrays
     values: dict[str, Any] = dict(
-      rods=_stack(shared | each | {"own": {"moved": np.zeros(0)} | own}, nworld, device),
+      rods=_stack(shared | each | {"own": dict.fromkeys(spans, np.zeros(0)) | own}, nworld, device),
       nv=bare.nv,
       flex=mujoco.mj_name2id(bare, mujoco.mjtObj.mjOBJ_FLEX, organ.name),
       sparse=int(m.is_sparse),

@@ -318,12 +318,14 @@ class RodState:
   accelerated: doubles("nv")  # their acceleration then
   broken: doubles("nvert")  # whether an edge has broken
   moved: doubles("nmoved")  # how far each node has along the thread, see `solver/rod_refine.h` [m]
+  rest_curvature: doubles("nyield")  # of each node, in the slides' axes, see `tissue/rod.h`
   signature: doubles(1)  # of the thread; 0 where it was set by hand [-]
 
 
-def rod_sizes(nvert: int, nv: int, refine: Any) -> dict[str, int]:
-  """Returns the sizes of `RodState` of a thread whose nodes move along it, or not."""
-  return {"nvert": nvert, "nv": nv, "nmoved": nvert if refine else 0}
+def rod_sizes(nvert: int, nv: int, refine: Any, yields: Any) -> dict[str, int]:
+  """Returns the sizes of `RodState`, of nodes that move along a thread or not, and yield or not."""
+  sizes = {"nmoved": nvert if refine else 0, "nyield": 3 * nvert if yields else 0}
+  return {"nvert": nvert, "nv": nv} | sizes
 
 
 @struct

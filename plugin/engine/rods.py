@@ -57,7 +57,8 @@ class Rod:
 
   nnode: int  # nodes
   newton: int  # most iterations of a step
-  twists: int  # whether it resists twisting
+  twists: int  # whether its edges turn about themselves
+  yields: int  # whether it keeps bends
   most_rows: int  # MuJoCo's rows that there is room for
   most_nodes: int  # nodes that there is room for, with those that stand for bodies and vertices
   most_vertices: int  # vertices of organs that there is room for
@@ -75,6 +76,7 @@ class Rod:
   stretch: doubles("nnode")  # E A / length of an edge [N/m]
   bend: doubles("nnode")  # E I over the length of a node [N m]
   torsion: doubles("nnode")  # G J over the length of a node [N m]
+  most_bent: doubles("nnode")  # curvature less that at rest, see `Bent`, beyond which a node yields
   mass: doubles("nnode")  # of a node [kg]
   drag: doubles("nnode")  # force against a node by its velocity [N s/m]
   spin: doubles("nnode")  # inertia of an edge about itself [kg m^2]
@@ -202,7 +204,7 @@ class Declaration:
 
   def sizes(self, nv: int) -> dict[str, int]:
     """Returns the sizes of its `RodState` among nv dofs."""
-    return layout.rod_sizes(len(self.rest), nv, self.config.refine)
+    return layout.rod_sizes(len(self.rest), nv, self.config.refine, self.config.yield_strain)
 
   @property
   def dofs(self) -> np.ndarray:

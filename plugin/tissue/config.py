@@ -114,6 +114,13 @@ class Config:
     'with `elements="rod"` alone',
     "N",
   )
+  yield_strain: float = _row(
+    0.0,
+    reading.NOT_NEGATIVE,
+    "strain at a rod's surface beyond which it keeps its bend: it yields at a curvature of "
+    "`yield_strain` / radius ([threads](physics.md#plastic-bending)); 0: never; with "
+    '`elements="rod"` alone',
+  )
   drag: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
@@ -305,8 +312,10 @@ RUNNING = tuple(key for key, row in ROWS.items() if row.change)
 MATERIAL = tuple(key for key, row in ROWS.items() if row.change == TISSUE)
 # All that a rod may have:
 ROD = (
-  *("elements", "young", "poisson", "bend", "twist", "strength", "drag", "refine", "iterations"),
+  *("elements", "young", "poisson", "bend", "twist", "strength", "yield_strain", "drag"),
+  *("refine", "iterations"),
 )
+_ONLY_RODS = {"twist", "strength", "yield_strain", "drag", "refine"}
 RECORDED = tuple(key for key, row in ROWS.items() if row.change == GRAPH)
 
 
@@ -430,9 +439,14 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
         raise ValueError(
           f"organ {organ!r}: {key} is set and elements is 'rod', expected {', '.join(ROD)}"
         )
-  elif only_rods := {"twist", "strength", "drag", "refine"} & set(given):
+  elif only_rods := _ONLY_RODS & set(given):
     key = min(only_rods)
     raise ValueError(f"organ {organ!r}: {key} is set, allowed only with elements='rod'")
+  if config.yield_strain and not config.twist:
+    raise ValueError(
+      f"organ {organ!r}: yield_strain is {config.yield_strain:g}, allowed only where twist is not "
+      "0: a bend that is kept turns with the thread"
+    )
   spring = config.elements == "spring"
   if spring and "stiffness" not in given:
     raise ValueError(f"organ {organ!r}: elements is 'spring' and stiffness is missing [N/m]")

@@ -30,6 +30,8 @@ def check_refine(name: str, config: Config, length: np.ndarray, radius: float, c
     )
   if len(config.young) > 1:
     raise ValueError(f"{what} young has {len(config.young)} values, expected one")
+  if config.yield_strain:
+    raise ValueError(f"{what} yield_strain is {config.yield_strain:g}, expected 0")
   if any(clamped):
     raise ValueError(
       f"{what} edge {int(np.argmax(clamped))} is between two pinned nodes, expected none next to "
@@ -85,14 +87,25 @@ def tension(constants: dict, x: np.ndarray, broken: np.ndarray) -> np.ndarray:
   return (stretch * (length - constants["length"][:-1])).astype(float)
 
 
-def energy(constants: dict, x: np.ndarray, twist: np.ndarray, broken: np.ndarray) -> float:
-  """Returns the elastic energy [J], see `tension`, with twists [rad], (nnode,)."""
+def energy(
+  constants: dict, x: np.ndarray, twist: np.ndarray, rest: np.ndarray, broken: np.ndarray
+) -> float:
+  """Returns the elastic energy [J].
+
+  Args:
+    constants: see `constants`
+    x: places [m]                      (nnode, 3)
+    twist: at each node [rad]          (nnode,)
+    rest: curvature at rest [-]        (nnode, 3)
+    broken: whether an edge has broken (nnode - 1,) bool
+  """
   edge = np.diff(x, axis=0)
   length = np.linalg.norm(edge, axis=1)
   stretched = 0.5 * tension(constants, x, broken) * (length - constants["length"][:-1])
   e, f = edge[:-1], edge[1:]
   chi = length[:-1] * length[1:] + (e * f).sum(axis=1)
-  curvature2 = 4 * (np.cross(e, f) ** 2).sum(axis=1) / chi**2
+  off = np.cross(e, f) - 0.5 * chi[:, None] * rest[1:-1]
+  curvature2 = 4 * (off**2).sum(axis=1) / chi**2
   bent = 0.5 * np.where(broken[1:] | broken[:-1], 0.0, constants["bend"][1:-1]) * curvature2
   return float(stretched.sum() + bent.sum() + 0.5 * (constants["torsion"] * twist**2).sum())
 
@@ -124,11 +137,15 @@ def constants(
   node_young = 0.5 * (young[1:] + young[:-1])
   shear = node_young / (2 * (1 + config.poisson))
   bend, torsion, along = np.zeros(n), np.zeros(n), np.append(0.0, np.cumsum(length))
+  most_bent = np.zeros(n)
   bend[1:-1] = config.bend * node_young * second / at
   torsion[1:-1] = config.twist * shear * 2 * second / at
+  most_bent[1:-1] = config.yield_strain / radius * at
   return {
     "nnode": n,
-    "twists": int(config.twist > 0 and clamped.sum() > 1),  # else nothing holds a twist
+    # Else nothing holds a twist; but a bend that is kept turns with the thread.
+    "twists": int((config.twist > 0 and clamped.sum() > 1) or config.yield_strain > 0),
+    "yields": int(config.yield_strain > 0),
     "shortest": float(length.min()),
     "longest": max(float(length.max()), bool(config.refine) * LONGEST * float(length.mean())),
     "length": np.append(length, 0.0),
@@ -143,5 +160,6 @@ def constants(
     "drag": config.drag * 0.5 * (np.append(length, 0.0) + np.append(0.0, length)),
     "bend": bend,
     "torsion": torsion,
+    "most_bent": most_bent,
     "spin": np.append(0.25 * (mass[1:] + mass[:-1]), 1.0) * radius**2,
   }

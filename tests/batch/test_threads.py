@@ -275,6 +275,29 @@ def test_nodes_move_along_a_thread_as_in_one_world(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_a_thread_keeps_its_bends_as_under_the_plugin(device):
+  """It swings on a peg; its state goes from world to world by an mjData, and a reset forgets it."""
+  peg = '<geom type="capsule" size=".002 .02" pos=".012 0 -.01" euler="90 0 0"/>'
+  text = one.document(one.line(31, 0.03), pin=(0, 1), world=peg, bend=0.05, yield_strain=5e-4)
+  model, data, thread, worlds = scene(text, device)
+  load(model, data, worlds, 30, (0, 1e-4, -1e-3))
+  run(model, data, worlds, 100)
+  rest = thread.rest_curvature
+  assert np.linalg.norm(rest, axis=1).max() > 0.05
+  assert off(thread, worlds) < 2e-5
+  other = mujoco.MjData(model)
+  worlds.get_state(1, other)
+  np.testing.assert_allclose(palpate.Thread(model, other, "t").rest_curvature, rest, atol=1e-3)
+  worlds.set_state(0, other)
+  worlds.step(10)
+  first, second = worlds.thread("t").xpos.numpy()
+  np.testing.assert_array_equal(first, second)
+  worlds.reset()
+  worlds.get_state(1, other)
+  assert not palpate.Thread(model, other, "t").rest_curvature.any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_a_thread_that_is_torn_apart_is_reset(device):
   _, _, _, worlds = scene(one.document(one.line(11, 0.02), pin=(0,)), device)
   worlds.step(5)

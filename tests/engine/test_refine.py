@@ -130,6 +130,7 @@ def test_nothing_goes_through_itself_while_nodes_move(seed):
     ({"refine": 5e-5}, "refine is 0.05 mm .* no shorter than the radius, 0.1 mm"),
     ({"refine": 3e-4, "young": "1e9 " * 10}, "young has 10 values, expected one"),
     ({"refine": 3e-4, "pin": (3, 4)}, "edge 3 is between two pinned nodes"),
+    ({"refine": 3e-4, "yield_strain": 0.02}, "refine is 0.3 mm and yield_strain is 0.02"),
   ],
 )
 def test_what_cannot_be_refined_is_named(keys, message):

@@ -11,6 +11,7 @@ from scenes.rods import (
   FREE,
   MASS,
   POISSON,
+  RADIUS,
   STRETCH,
   document,
   force,
@@ -106,9 +107,11 @@ def test_free_flight_keeps_momentum():
   np.testing.assert_allclose(data.qvel.reshape(-1, 3).sum(axis=0), before, rtol=1e-9)
 
 
-def test_energy_only_falls():
-  """Though light nodes are flung about, no step takes more than 10 iterations."""
-  model, data, thread = load(line(41, 0.08), pin=(0,), option=FREE, iterations=10)
+@pytest.mark.parametrize(("yield_strain", "iterations"), [(0, 10), (2e-4, 30)])
+def test_energy_only_falls(yield_strain, iterations):
+  """Though light nodes are flung about, no step takes more than so many iterations."""
+  keys = dict(option=FREE, iterations=iterations, yield_strain=yield_strain)
+  model, data, thread = load(line(41, 0.08), pin=(0,), **keys)
   rng = np.random.RandomState(1)
   data.qvel[:] = np.repeat(rng.normal(0, 1.0, (8, 3)), 5, axis=0).ravel()
   energies = []
@@ -117,6 +120,7 @@ def test_energy_only_falls():
     energies.append(energy(data, thread))
   assert (np.diff(energies) <= 1e-9 * energies[0]).all()
   assert thread.error is None
+  assert np.any(thread.rest_curvature) == (yield_strain > 0)
 
 
 def test_a_plucked_thread_rings_down_by_its_drag():
@@ -147,13 +151,81 @@ def test_a_sudden_pull_of_a_newton_is_borne(h):
   assert np.abs(data.qvel).max() < 0.1
 
 
+# Plastic bending.
+
+
+def bend_of(thread):
+  """Returns the curvature of the nodes inside, as `Thread.rest_curvature`, (nnode - 2, 3)."""
+  e = np.diff(thread.positions, axis=0)
+  along = np.linalg.norm(e, axis=1)
+  chi = along[1:] * along[:-1] + (e[1:] * e[:-1]).sum(axis=1)
+  return 2 * np.cross(e[:-1], e[1:]) / chi[:, None]
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9, 1.1])
+def test_a_bent_thread_springs_back_by_what_it_bears(share):
+  """Let go from an arc of curvature k it keeps k - yield_strain / radius (perfect plasticity)."""
+  curvature, edge = 50.0, 1e-3
+  most = share * curvature
+  model, data, thread = load(line(31, 30 * edge), option=FREE, yield_strain=most * RADIUS)
+  angle = 2 * np.arctan(0.5 * curvature * edge) * np.arange(30)
+  steps = edge * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+  rest = np.tile([0, -max(0.0, curvature - most) * edge, 0], (29, 1))
+  thread.lay(np.append(np.zeros((1, 3)), np.cumsum(steps, axis=0), axis=0))
+  model.opt.timestep = 1e-8  # its inertia holds it
+  run(model, data, 1)
+  model.opt.timestep = 0.01
+  for _ in range(2):
+    np.testing.assert_allclose(thread.rest_curvature[1:-1], rest, atol=1e-7)
+    run(model, data, 100)
+  np.testing.assert_allclose(bend_of(thread), rest, atol=1e-7)
+  assert thread.energy < 1e-15
+
+
+def test_what_does_not_yield_moves_as_an_elastic_thread():
+  """To 0.1 um: a thread that may yield has its twist among its unknowns."""
+  threads = []
+  for keys in ({}, {"yield_strain": 0.01}):
+    model, data, thread = load(line(42, 0.0615, -0.0015), pin=(0, 1), option=FREE, **keys)
+    force(model, data, 41, (0, 1e-4, -4 * BENDING / 0.06**2))
+    run(model, data, 60)
+    threads.append(thread)
+  assert not thread.rest_curvature.any() and np.abs(bend_of(thread)).max() > 0.05
+  np.testing.assert_allclose(threads[1].positions, threads[0].positions, atol=1e-7)
+
+
+def test_a_bend_that_is_kept_turns_with_the_thread():
+  """About an axis along one of its ends, by more than a turn of which nothing is lost."""
+  model, data, thread = load(line(41, 0.04), h=0.01, option=FREE, yield_strain=5e-4)
+  s = np.linspace(0, 0.04, 41)
+  bends = np.stack([s - 5 * s**2, 40 * s**3, 8 * s**2], axis=1)
+  thread.lay(bends)
+  model.opt.timestep = 1e-8
+  run(model, data, 1)
+  model.opt.timestep = 0.01
+  run(model, data, 100)
+  before, rest = bend_of(thread), thread.rest_curvature[1:-1]
+  size = np.linalg.norm(rest, axis=1)
+  assert size.max() > 0.01
+  np.testing.assert_allclose(rest, before, atol=1e-4)
+  places = thread.positions
+  axis = (places[1] - places[0]) / np.linalg.norm(places[1] - places[0])
+  data.qvel[:] = 2.0 * np.cross(axis, places - places.mean(axis=0)).ravel()
+  run(model, data, 150)
+  after = bend_of(thread)
+  np.testing.assert_allclose(thread.rest_curvature[1:-1], after, atol=1e-3)
+  np.testing.assert_allclose(np.linalg.norm(after, axis=1), size, atol=1e-3)
+  assert ((before * after).sum(axis=1) < 0.0)[size > 0.01].all()
+
+
 # States.
 
 
-def test_a_state_has_all_there_is_to_the_bit():
+@pytest.mark.parametrize("yield_strain", [0, 1e-3])
+def test_a_state_has_all_there_is_to_the_bit(yield_strain):
   points = line(21, 0.04)
   args = dict(pin=(0, 1, 19, 20), world='<geom type="capsule" size=".004 .02" pos=".02 0 -.006"/>')
-  model, data, thread = load(points, **args)
+  model, data, thread = load(points, yield_strain=yield_strain, **args)
   data.qvel[1::3] = 0.05
   data.qvel[2::3] = -0.2
   thread.turn(0, 0.3)
@@ -165,6 +237,7 @@ def test_a_state_has_all_there_is_to_the_bit():
 
   scenes.goes_on(model, data, drive)
   assert np.abs(thread.twist).max() > 1e-3
+  assert np.any(thread.rest_curvature) == (yield_strain > 0)
 
 
 def test_reset_forgets_twist_and_errors():
@@ -262,6 +335,8 @@ def test_a_foreign_state_is_refused():
      "edges 0 and 3 start 0 mm from each other and radius is 0.1 mm"),
     (dict(points=line(5, 0.01), thickness=0.001), "thickness is set and elements is 'rod'"),
     (dict(points=line(5, 0.01), twist=-1), "thread 't': twist is '-1', expected a number >= 0"),
+    (dict(points=line(5, 0.01), yield_strain=-1), "yield_strain is '-1', expected a number >= 0"),
+    (dict(points=line(5, 0.01), yield_strain=0.1, twist=0), "allowed only where twist is not 0"),
     (dict(points=line(5, 0.01), option='integrator="RK4"'), "RK4"),
     (dict(points=line(5, 0.01), elements="solid"), "flexcomp dim is 1, expected dim='2'"),
     (dict(points=line(5, 0.01), contact='selfcollide="auto"'), "selfcollide"),

@@ -33,6 +33,7 @@ REFUSED = [
   ("tension", "-1", "a number >= 0"),
   ("twist", "-1", "a number >= 0"),
   ("strength", "-1", "a number >= 0"),
+  ("yield_strain", "-0.1", "a number >= 0"),
   ("drag", "-1", "a number >= 0"),
   ("refine", "-1", "a number >= 0"),
   ("pressure", "inf", "a finite number"),

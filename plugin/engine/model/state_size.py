@@ -11,8 +11,9 @@ def state_size(model: int, instance: int) -> int:
   """Returns the length of the plugin state: at least what `coupling.sizes` will ask for."""
   m = mjstruct.model(model)
   if declare.is_rod(m, instance):
-    refine = mjstruct.config(m, instance, "refine").strip() not in ("", "0")
-    return layout.size(RodState, layout.rod_sizes(m.nflexvert, m.nv, refine))
+    keys = "refine", "yield_strain"
+    refine, yields = (mjstruct.config(m, instance, key).strip() not in ("", "0") for key in keys)
+    return layout.size(RodState, layout.rod_sizes(m.nflexvert, m.nv, refine, yields))
   relaxes, rests, bonded = (
     bool(mjstruct.config(m, instance, key).strip()) for key in ("relax_share", "support", "bonds")
   )

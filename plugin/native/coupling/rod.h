@@ -566,6 +566,11 @@ PALPATE void end(const Host& host, double h) {
   const int inner = rod.twists ? rod.nnode - 1 : 0;
   each_lane(1, inner, [&](int i) { rod.trial.data[i] = twist_at(rod, rod.place.data, rod.turn.data, i); });
   each_lane(1, inner, [&](int i) { rod.own.twist.data[i] = is_joint(rod, i) ? rod.trial.data[i] : 0.0; });
+  if (rod.yields && rod.status.data[0] >= 0) {
+    each_lane(1, rod.nnode - 1, [&](int i) {
+      if (is_joint(rod, i)) yield_at(rod, rod.place.data, rod.turn.data, i);
+    });
+  }
   break_edge(rod);
   each_lane(0, 3 * rod.nnode, [&](int a) { rod.vel.data[a] = (1.0 / h) * (rod.place.data[a] - rod.start.data[a]); });
   if (rod.refine > 0.0 && rod.status.data[0] >= 0) refine(rod);

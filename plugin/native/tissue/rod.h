@@ -1,5 +1,6 @@
 // A discrete elastic rod: stretching, bending and twisting (Bergou et al. 2008,
-// doi:10.1145/1360612.1360662, and 2010, doi:10.1145/1778765.1778853), straight where nothing acts.
+// doi:10.1145/1360612.1360662, and 2010, doi:10.1145/1778765.1778853), straight where nothing acts, unless it
+// has yielded: then a node has a curvature at rest.
 //
 // Node i has four unknowns, its place and the turn of edge i, which leads to node i + 1, about itself.
 // A turn is counted from the start of the step. The twist at a node between two edges is kept from step
@@ -82,6 +83,27 @@ PALPATE double twist_at(const Fields& f, const double* x, const double* turn, in
          turned_against(tangent(x0, i - 1), tangent(x0, i), tangent(x, i - 1), tangent(x, i));
 }
 
+// A vector turned by the smallest rotation from the unit vector a to b.
+PALPATE D3 turned_along(D3 u, D3 a, D3 b) {
+  const double c = 1.0 + dot(a, b);
+  return u - (dot(u, a + b) / (c > 1e-9 ? c : 1e-9)) * (a + b) + 2.0 * dot(a, u) * b;
+}
+
+// The curvature at rest of a node, turned as one of its edges has since the step began.
+template <class Fields>
+PALPATE D3 rest_by(const Fields& f, const double* x, const double* turn, int i, int edge) {
+  const D3 a = tangent(f.start.data, edge), b = tangent(x, edge);
+  const D3 u = turned_along(load(f.own.rest_curvature.data + 3 * i), a, b);
+  const double c = cos(turn[edge]), s = sin(turn[edge]);
+  return c * u + s * cross(b, u) + ((1.0 - c) * dot(b, u)) * b;
+}
+
+// The mean of both, as long as the edges turn alike.
+template <class Fields>
+PALPATE D3 rest_at(const Fields& f, const double* x, const double* turn, int i) {
+  return 0.5 * (rest_by(f, x, turn, i, i - 1) + rest_by(f, x, turn, i, i));
+}
+
 // The elastic energy of this lane's nodes [J].
 template <class Fields>
 CALLED double rod_energy(const Fields& f, const double* x, const double* turn) {
@@ -90,7 +112,8 @@ CALLED double rod_energy(const Fields& f, const double* x, const double* turn) {
     const double longer = norm(load(x + 3 * i + 3) - load(x + 3 * i)) - f.length.data[i];
     if (is_whole(f, i)) sum += 0.5 * f.stretch.data[i] * longer * longer;
     if (!i || !is_joint(f, i)) return;
-    const D3 k = bent(x, i).curvature;
+    D3 k = bent(x, i).curvature;
+    if (f.yields) k = k - rest_at(f, x, turn, i);
     sum += 0.5 * f.bend.data[i] * dot(k, k);
     if (f.twists) {
       const double m = twist_at(f, x, turn, i);
@@ -200,6 +223,50 @@ PALPATE void add_twist(const Fields& f, const Bent& b, int i, double twist, doub
       H.add(i - 1 + n, n < 2 ? 4 : 3, i - 1 + m, m < 2 ? 4 : 3, [&](int c, int d) { return k * v[4 * n + c] * v[4 * m + d]; });
 }
 
+// Adds the gradient of the bending of node i, which may have a curvature at rest, and its second derivative but for that
+// of the curvatures themselves (Gauss-Newton). Rest curvature turns with the edges, and with their turns.
+template <class Fields>
+PALPATE void add_bend(const Fields& f, const double* x, const double* turn, const Bent& b, int i, double* g, const RodMatrix& H) {
+  const D3 by_e = rest_by(f, x, turn, i, i - 1), by_f = rest_by(f, x, turn, i, i), k = b.curvature;
+  const D3 off = k - 0.5 * (by_e + by_f), e = (1.0 / b.le) * b.e, d = (1.0 / b.lf) * b.f;
+  // An edge turns about itself as it is moved: the smallest rotation from where it was does.
+  const auto about = [&](int edge, D3 now) {
+    const D3 before = tangent(f.start.data, edge);
+    return (1.0 / (1.0 + dot(before, now) + 1e-300)) * cross(before, now);
+  };
+  const D3 he = about(i - 1, e), hf = about(i, d);
+  D3 J[12] = {};  // of `off`, by three nodes and their turns
+  for (int c = 0; c < 3; ++c) {
+    const D3 axis = {c == 0 ? 1.0 : 0.0, c == 1 ? 1.0 : 0.0, c == 2 ? 1.0 : 0.0};
+    const D3 turns_e = (1.0 / b.le) * (cross(e, axis) - dot(he, axis) * e);
+    const D3 turns_f = (1.0 / b.lf) * (cross(d, axis) - dot(hf, axis) * d);
+    const double chi_e = b.lf * dot(e, axis) + dot(b.f, axis), chi_f = b.le * dot(d, axis) + dot(b.e, axis);
+    const D3 Je = (1.0 / b.chi) * (2.0 * cross(axis, b.f) - chi_e * k) - 0.5 * cross(turns_e, by_e);
+    const D3 Jf = (1.0 / b.chi) * (2.0 * cross(b.e, axis) - chi_f * k) - 0.5 * cross(turns_f, by_f);
+    J[c] = -1.0 * Je, J[4 + c] = Je - Jf, J[8 + c] = Jf;
+  }
+  J[3] = -0.5 * cross(e, by_e), J[7] = -0.5 * cross(d, by_f);
+  const double B = f.bend.data[i];
+  for (int a = 0; a < 11; ++a) g[4 * i - 4 + a] += B * dot(off, J[a]);
+  for (int n = 0; n < 3; ++n)
+    for (int m = 0; m <= n; ++m)
+      H.add(i - 1 + n, n < 2 ? 4 : 3, i - 1 + m, m < 2 ? 4 : 3, [&](int c, int d) { return B * dot(J[4 * n + c], J[4 * m + d]); });
+}
+
+// Keeps the bend by which a node is bent further than it bears at the end of a step, at x (perfect plasticity; return
+// mapping, Simo and Hughes 1998, doi:10.1007/b98904, section 1.4).
+template <class Fields>
+PALPATE void yield_at(const Fields& f, const double* x, const double* turn, int i) {
+  double* own = f.own.rest_curvature.data + 3 * i;
+  const D3 mean = rest_at(f, x, turn, i);
+  const double most = f.most_bent.data[i], length = norm(mean);
+  D3 rest = length > 0.0 ? (norm(load(own)) / length) * mean : mean;  // as long as before
+  const D3 off = bent(x, i).curvature - rest;
+  const double far = norm(off);
+  if (far > most) rest = rest + (1.0 - most / far) * off;
+  store(own, rest);
+}
+
 // Adds the gradient of the energy and its second derivative, or where that is not to be `exact` a part of it
 // that is positive: without the thrust of edges, and without what a moment does as edges turn. Edges resist turning by
 // the tension that a whole move led to expect, `f.pull`: as a light node swings far its edge gets longer for now, and by
@@ -222,26 +289,34 @@ PALPATE void add_rod(const Fields& f, const double* x, const double* turn, doubl
     // The energy is 2 B t^2, t the tangent of half the angle between the edges: in their plane a function
     // of that angle, across it of how they turn against each other and with each other.
     const Bent b = bent(x, i);
+    if (f.yields) add_bend(f, x, turn, b, i, g, H);
     const double t = 0.5 * norm(b.curvature), B = f.bend.data[i], more = 1.0 + t * t;
     const D3 e = (1.0 / b.le) * b.e, d = (1.0 / b.lf) * b.f;
     const D3 axis = fabs(e.x) < 0.6 ? D3{1.0, 0.0, 0.0} : D3{0.0, 1.0, 0.0};
     const D3 n = unit(t > 1e-12 ? b.curvature : cross(e, axis)), pe = cross(n, e), pf = cross(n, d);
-    const double re = 1.0 / b.le, rf = 1.0 / b.lf, moment = 2.0 * B * t * more;
-    const D3 at_e = -moment * re * pe, at_f = moment * rf * pf;
-    store(g + 4 * i - 4, load(g + 4 * i - 4) - at_e);
-    store(g + 4 * i, load(g + 4 * i) + at_e - at_f);
-    store(g + 4 * i + 4, load(g + 4 * i + 4) + at_f);
+    const double re = 1.0 / b.le, rf = 1.0 / b.lf;
+    const double moment = f.yields ? B * dot(n, b.curvature - rest_at(f, x, turn, i)) * more : 2.0 * B * t * more;
     // By the edges e and f, in their plane and across it.
-    const double in = B * more * (1.0 + 3.0 * t * t), turns = exact ? B * t * t * more : 0.0, bends = exact ? moment : 0.0;
+    double in = B * more * (1.0 + 3.0 * t * t), out = B * more, turns = exact ? B * t * t * more : 0.0;
+    const double bends = exact ? moment : 0.0;
+    if (f.yields) {  // what the moment does as the edges turn; the rest is added
+      turns = in = exact ? moment * t : 0.0;
+      out = 0.0;
+    } else {
+      const D3 at_e = -moment * re * pe, at_f = moment * rf * pf;
+      store(g + 4 * i - 4, load(g + 4 * i - 4) - at_e);
+      store(g + 4 * i, load(g + 4 * i) + at_e - at_f);
+      store(g + 4 * i + 4, load(g + 4 * i + 4) + at_f);
+    }
     const double E[3] = {e.x, e.y, e.z}, F[3] = {d.x, d.y, d.z}, N[3] = {n.x, n.y, n.z};
     const double P[3] = {pe.x, pe.y, pe.z}, Q[3] = {pf.x, pf.y, pf.z};
     double ee[3][3], fe[3][3], ff[3][3];
     for (int c = 0; c < 3; ++c)
       for (int k = 0; k < 3; ++k) {
         const double across = N[c] * N[k];
-        ee[c][k] = re * re * (in * P[c] * P[k] + (B * more - turns) * across + bends * (E[c] * P[k] + P[c] * E[k]));
-        ff[c][k] = rf * rf * (in * Q[c] * Q[k] + (B * more - turns) * across - bends * (F[c] * Q[k] + Q[c] * F[k]));
-        fe[c][k] = -re * rf * (in * Q[c] * P[k] + (B * more + turns) * across);
+        ee[c][k] = re * re * (in * P[c] * P[k] + (out - turns) * across + bends * (E[c] * P[k] + P[c] * E[k]));
+        ff[c][k] = rf * rf * (in * Q[c] * Q[k] + (out - turns) * across - bends * (F[c] * Q[k] + Q[c] * F[k]));
+        fe[c][k] = -re * rf * (in * Q[c] * P[k] + (out + turns) * across);
       }
     H.add(i - 1, 3, i - 1, 3, [&](int c, int k) { return ee[c][k]; });
     H.add(i, 3, i - 1, 3, [&](int c, int k) { return fe[c][k] - ee[c][k]; });
