@@ -223,34 +223,75 @@ PALPATE void add_twist(const Fields& f, const Bent& b, int i, double twist, doub
       H.add(i - 1 + n, n < 2 ? 4 : 3, i - 1 + m, m < 2 ? 4 : 3, [&](int c, int d) { return k * v[4 * n + c] * v[4 * m + d]; });
 }
 
-// Adds the gradient of the bending of node i, which may have a curvature at rest, and its second derivative but for that
-// of the curvatures themselves (Gauss-Newton). Rest curvature turns with the edges, and with their turns.
+// Adds the gradient of the bending of node i, which may have a curvature at rest, and its second derivative: where that
+// is not to be `exact` the part by the first derivatives (Gauss-Newton). Unknowns are both edges e and f, each with its
+// turn about itself, until they are spread to the nodes.
 template <class Fields>
-PALPATE void add_bend(const Fields& f, const double* x, const double* turn, const Bent& b, int i, double* g, const RodMatrix& H) {
-  const D3 by_e = rest_by(f, x, turn, i, i - 1), by_f = rest_by(f, x, turn, i, i), k = b.curvature;
-  const D3 off = k - 0.5 * (by_e + by_f), e = (1.0 / b.le) * b.e, d = (1.0 / b.lf) * b.f;
-  // An edge turns about itself as it is moved: the smallest rotation from where it was does.
-  const auto about = [&](int edge, D3 now) {
-    const D3 before = tangent(f.start.data, edge);
-    return (1.0 / (1.0 + dot(before, now) + 1e-300)) * cross(before, now);
-  };
-  const D3 he = about(i - 1, e), hf = about(i, d);
-  D3 J[12] = {};  // of `off`, by three nodes and their turns
-  for (int c = 0; c < 3; ++c) {
-    const D3 axis = {c == 0 ? 1.0 : 0.0, c == 1 ? 1.0 : 0.0, c == 2 ? 1.0 : 0.0};
-    const D3 turns_e = (1.0 / b.le) * (cross(e, axis) - dot(he, axis) * e);
-    const D3 turns_f = (1.0 / b.lf) * (cross(d, axis) - dot(hf, axis) * d);
-    const double chi_e = b.lf * dot(e, axis) + dot(b.f, axis), chi_f = b.le * dot(d, axis) + dot(b.e, axis);
-    const D3 Je = (1.0 / b.chi) * (2.0 * cross(axis, b.f) - chi_e * k) - 0.5 * cross(turns_e, by_e);
-    const D3 Jf = (1.0 / b.chi) * (2.0 * cross(b.e, axis) - chi_f * k) - 0.5 * cross(turns_f, by_f);
-    J[c] = -1.0 * Je, J[4 + c] = Je - Jf, J[8 + c] = Jf;
+PALPATE void add_bend(
+    const Fields& f, const double* x, const double* turn, const Bent& b, int i, double* g, const RodMatrix& H,
+    bool exact) {
+  const D3 rest[2] = {rest_by(f, x, turn, i, i - 1), rest_by(f, x, turn, i, i)};
+  const D3 k = b.curvature, off = k - 0.5 * (rest[0] + rest[1]), edge[2] = {b.e, b.f};
+  const double length[2] = {b.le, b.lf}, per = 1.0 / b.chi;
+  // Of each unknown: what it adds to `off`, how it turns its edge, and what it adds to chi; products of these.
+  D3 by[8], turns[8];
+  double chi[8] = {}, bends[8] = {}, along[8], across[8], along_edge[8] = {};
+  for (int s = 0; s < 2; ++s) {
+    const D3 other = edge[1 - s], own = (1.0 / length[s]) * edge[s], before = tangent(f.start.data, i - 1 + s);
+    // It turns about itself as it is moved: the smallest rotation from where it was does.
+    const D3 about = (1.0 / (1.0 + dot(before, own) + 1e-300)) * cross(before, own);
+    for (int c = 0; c < 4; ++c) {
+      const int a = 4 * s + c;
+      const D3 axis = {c == 0 ? 1.0 : 0.0, c == 1 ? 1.0 : 0.0, c == 2 ? 1.0 : 0.0};
+      D3 curves = {0.0, 0.0, 0.0};
+      turns[a] = own;
+      if (c < 3) {
+        along_edge[a] = dot(own, axis);
+        chi[a] = length[1 - s] * along_edge[a] + dot(other, axis);
+        curves = per * (2.0 * (s ? cross(other, axis) : cross(axis, other)) - chi[a] * k);
+        turns[a] = (1.0 / length[s]) * (cross(own, axis) - dot(about, axis) * own);
+      }
+      bends[a] = dot(off, curves);
+      by[a] = curves - 0.5 * cross(turns[a], rest[s]);
+      along[a] = dot(turns[a], off), across[a] = dot(turns[a], rest[s]);
+    }
   }
-  J[3] = -0.5 * cross(e, by_e), J[7] = -0.5 * cross(d, by_f);
+  const double whole = dot(off, k), o[3] = {off.x, off.y, off.z};
+  double slope[8], M[8][8];
+  for (int p = 0; p < 8; ++p) {
+    slope[p] = dot(off, by[p]);
+    for (int q = 0; q <= p; ++q) {
+      double value = dot(by[p], by[q]);
+      if (exact) {
+        const int s = p / 4, c = p % 4, d = q % 4;
+        const double same = c == d ? 1.0 : 0.0;
+        value -= per * (bends[p] * chi[q] + bends[q] * chi[p]);
+        if (s == q / 4)  // how the edge turns its curvature at rest further
+          value += 0.5 * dot(off, rest[s]) * dot(turns[p], turns[q]) - 0.25 * (along[p] * across[q] + across[p] * along[q]);
+        if (c < 3 && d < 3) {
+          const double both = s == q / 4 ? length[1 - s] / length[s] * (same - along_edge[p] * along_edge[q])
+                                         : same + along_edge[p] * along_edge[q];
+          const double crossed = s == q / 4 || c == d ? 0.0 : (c - d + 3) % 3 == 1 ? o[3 - c - d] : -o[3 - c - d];
+          value += per * (2.0 * crossed - whole * both);
+        }
+      }
+      M[p][q] = M[q][p] = value;
+    }
+  }
+  const auto spread = [](const double* v, int a) {
+    return a < 3 ? -v[a] : a == 3 || a == 7 ? v[a] : a < 7 ? v[a - 4] - v[a] : v[a - 4];
+  };
   const double B = f.bend.data[i];
-  for (int a = 0; a < 11; ++a) g[4 * i - 4 + a] += B * dot(off, J[a]);
+  double rows[11][8];
+  for (int a = 0; a < 11; ++a) {
+    g[4 * i - 4 + a] += B * spread(slope, a);
+    for (int q = 0; q < 8; ++q) rows[a][q] = spread(M[q], a);
+  }
   for (int n = 0; n < 3; ++n)
-    for (int m = 0; m <= n; ++m)
-      H.add(i - 1 + n, n < 2 ? 4 : 3, i - 1 + m, m < 2 ? 4 : 3, [&](int c, int d) { return B * dot(J[4 * n + c], J[4 * m + d]); });
+    for (int m = 0; m <= n; ++m) {
+      const auto value = [&](int c, int d) { return B * spread(rows[4 * n + c], 4 * m + d); };
+      H.add(i - 1 + n, n < 2 ? 4 : 3, i - 1 + m, m < 2 ? 4 : 3, value);
+    }
 }
 
 // Keeps the bend by which a node is bent further than it bears at the end of a step, at x (perfect plasticity; return
@@ -289,34 +330,31 @@ PALPATE void add_rod(const Fields& f, const double* x, const double* turn, doubl
     // The energy is 2 B t^2, t the tangent of half the angle between the edges: in their plane a function
     // of that angle, across it of how they turn against each other and with each other.
     const Bent b = bent(x, i);
-    if (f.yields) add_bend(f, x, turn, b, i, g, H);
+    if (f.yields) {
+      add_bend(f, x, turn, b, i, g, H, exact);
+      add_twist(f, b, i, twist_at(f, x, turn, i), g, H);
+      return;
+    }
     const double t = 0.5 * norm(b.curvature), B = f.bend.data[i], more = 1.0 + t * t;
     const D3 e = (1.0 / b.le) * b.e, d = (1.0 / b.lf) * b.f;
     const D3 axis = fabs(e.x) < 0.6 ? D3{1.0, 0.0, 0.0} : D3{0.0, 1.0, 0.0};
     const D3 n = unit(t > 1e-12 ? b.curvature : cross(e, axis)), pe = cross(n, e), pf = cross(n, d);
-    const double re = 1.0 / b.le, rf = 1.0 / b.lf;
-    const double moment = f.yields ? B * dot(n, b.curvature - rest_at(f, x, turn, i)) * more : 2.0 * B * t * more;
+    const double re = 1.0 / b.le, rf = 1.0 / b.lf, moment = 2.0 * B * t * more;
+    const D3 at_e = -moment * re * pe, at_f = moment * rf * pf;
+    store(g + 4 * i - 4, load(g + 4 * i - 4) - at_e);
+    store(g + 4 * i, load(g + 4 * i) + at_e - at_f);
+    store(g + 4 * i + 4, load(g + 4 * i + 4) + at_f);
     // By the edges e and f, in their plane and across it.
-    double in = B * more * (1.0 + 3.0 * t * t), out = B * more, turns = exact ? B * t * t * more : 0.0;
-    const double bends = exact ? moment : 0.0;
-    if (f.yields) {  // what the moment does as the edges turn; the rest is added
-      turns = in = exact ? moment * t : 0.0;
-      out = 0.0;
-    } else {
-      const D3 at_e = -moment * re * pe, at_f = moment * rf * pf;
-      store(g + 4 * i - 4, load(g + 4 * i - 4) - at_e);
-      store(g + 4 * i, load(g + 4 * i) + at_e - at_f);
-      store(g + 4 * i + 4, load(g + 4 * i + 4) + at_f);
-    }
+    const double in = B * more * (1.0 + 3.0 * t * t), turns = exact ? B * t * t * more : 0.0, bends = exact ? moment : 0.0;
     const double E[3] = {e.x, e.y, e.z}, F[3] = {d.x, d.y, d.z}, N[3] = {n.x, n.y, n.z};
     const double P[3] = {pe.x, pe.y, pe.z}, Q[3] = {pf.x, pf.y, pf.z};
     double ee[3][3], fe[3][3], ff[3][3];
     for (int c = 0; c < 3; ++c)
       for (int k = 0; k < 3; ++k) {
         const double across = N[c] * N[k];
-        ee[c][k] = re * re * (in * P[c] * P[k] + (out - turns) * across + bends * (E[c] * P[k] + P[c] * E[k]));
-        ff[c][k] = rf * rf * (in * Q[c] * Q[k] + (out - turns) * across - bends * (F[c] * Q[k] + Q[c] * F[k]));
-        fe[c][k] = -re * rf * (in * Q[c] * P[k] + (out + turns) * across);
+        ee[c][k] = re * re * (in * P[c] * P[k] + (B * more - turns) * across + bends * (E[c] * P[k] + P[c] * E[k]));
+        ff[c][k] = rf * rf * (in * Q[c] * Q[k] + (B * more - turns) * across - bends * (F[c] * Q[k] + Q[c] * F[k]));
+        fe[c][k] = -re * rf * (in * Q[c] * P[k] + (B * more + turns) * across);
       }
     H.add(i - 1, 3, i - 1, 3, [&](int c, int k) { return ee[c][k]; });
     H.add(i, 3, i - 1, 3, [&](int c, int k) { return fe[c][k] - ee[c][k]; });
