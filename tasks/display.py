@@ -6,7 +6,6 @@ import atexit
 import os
 import sys
 import threading
-from collections.abc import Callable
 from typing import Any
 
 from palpate.screen import has_display
@@ -63,13 +62,12 @@ if hasattr(os, "register_at_fork"):
 class Window:
   """MuJoCo's window on an exercise, without panels; it shows what the laparoscope sees."""
 
-  def __init__(self, physics, camera: str, key: Callable[[int], None] | None = None):
+  def __init__(self, physics, camera: str):
     """Opens the window.
 
     Args:
       physics: what it shows
       camera: name of the camera that it looks through
-      key: called with the GLFW number of a key that is pressed, in the window's thread
 
     Raises:
       RuntimeError: there is no display.
@@ -81,7 +79,7 @@ class Window:
     model = physics.model.ptr
     self.data, others = physics.data.ptr, set(threading.enumerate())
     self._handle: Any = mujoco.viewer.launch_passive(
-      model, self.data, key_callback=key, show_left_ui=False, show_right_ui=False
+      model, self.data, show_left_ui=False, show_right_ui=False
     )
     self._threads = set(threading.enumerate()) - others
     # Python must not end while the window's thread draws: MuJoCo then takes its library away.

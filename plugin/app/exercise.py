@@ -19,17 +19,12 @@ from .trainee import keeping
 
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
-  parser.epilog = (
-    "Keys with --performer keyboard: arrows pitch and yaw, W out, S in, A and D roll, O opens and "
-    "C closes the jaws, R reports, Esc ends."
-  )
   add = parser.add_argument
   add("task", metavar="TASK", nargs="?", help="such as touch/easy; a domain alone is its standard")
   add("--list", action="store_true", help="list the exercises and performers")
   add(
-    "--performer", metavar="NAME",
-    help="expert, tremor, ..., keyboard, or a policy as module:object (expert)",
-  )  # fmt: skip
+    "--performer", metavar="NAME", help="expert, tremor, ..., or a policy as module:object (expert)"
+  )
   add(
     "--device", metavar="NAME",
     help="do it live with a device: mouse, keyboard or touch on a page; gamepad, spacemouse, udp, "
@@ -157,7 +152,7 @@ def _list() -> int:
 
   for domain, task in suite.ALL_TASKS:
     print(f"{f'{domain}/{task}':24} {suite.summary(domain, task)}")
-  names = (*performer.STYLES, *performer.PEOPLE, "trained", "keyboard", "module:object")
+  names = (*performer.STYLES, *performer.PEOPLE, "trained", "module:object")
   print(f"performers: {', '.join(names)}")
   return 0
 
@@ -243,17 +238,10 @@ def _perform(
     return _by_hand(args, name, task_kwargs, info, journal)
   who = args.performer or "expert"
   info = {"task_kwargs": task_kwargs, "performer": who, **info}
-  if who == "keyboard":
-    from . import keyboard
-
-    env = options.load(name, task_kwargs)
-    run = functools.partial(keyboard.run, env, args.seed, info, journal=journal)
-  else:
-    performer.find(who, "keyboard")
-    env = options.load(name, task_kwargs)
-    act = performer.make(env, who, args.seed)
-    run = functools.partial(episode.run, env, act, args.seed, info, args.states, journal=journal)
-  return run
+  performer.find(who)
+  env = options.load(name, task_kwargs)
+  act = performer.make(env, who, args.seed)
+  return functools.partial(episode.run, env, act, args.seed, info, args.states, journal=journal)
 
 
 def _by_hand(
@@ -282,8 +270,7 @@ def _by_hand(
 
 def _views(args: argparse.Namespace, job: _Job) -> film.Strip | None:
   """Returns what takes the report's pictures; None where a person would wait for them."""
-  by_hand = args.device or args.performer == "keyboard"
-  wanted = job.folder and not (args.no_report or job.film or by_hand)
+  wanted = job.folder and not (args.no_report or job.film or args.device)
   return film.Strip() if wanted else None
 
 

@@ -174,12 +174,11 @@ def trained(env: Environment) -> policy.Policy:
   return policy.shipped(env.task.name, sees)
 
 
-def find(who: str, *others: str) -> Any:
+def find(who: str) -> Any:
   """Returns the style or the object that a name stands for; ValueError says what is wrong with it.
 
   Args:
     who: see `make`
-    *others: names that the caller takes as well, for the message
   """
   for found in (*PEOPLE.values(), trained):
     if who == found.__name__:
@@ -188,7 +187,7 @@ def find(who: str, *others: str) -> Any:
     return policy.load(who)
   if ":" not in who:
     if who not in STYLES:
-      names = ", ".join((*STYLES, *PEOPLE, trained.__name__, *others))
+      names = ", ".join((*STYLES, *PEOPLE, trained.__name__))
       raise ValueError(
         f"performer is {who!r}, expected one of {names}, a file of a "
         f"trained policy (*{policy.SUFFIX}) or module:object"

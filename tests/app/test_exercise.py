@@ -1,19 +1,10 @@
-"""`palpate exercise`: its files, replays, the keyboard, and how it ends."""
+"""`palpate exercise`: its files, replays, and how it ends."""
 
 import base64
-import contextlib
-import os
 import re
-import shutil
 import signal
-import subprocess
-import sys
-import threading
-import time
-import types
 
 import imageio.v3 as iio
-import mujoco
 import numpy as np
 import pytest
 from palpate.app import cli, console
@@ -171,123 +162,3 @@ def test_a_policy_that_cannot_be_made_is_one_line(tmp_path, capsys):
   (tmp_path / "lost.py").write_text(text)
   assert cli.main([*EASY, "--performer", "lost:P"]) == 2
   assert capsys.readouterr().err == "palpate: policy 'lost:P': OSError: no weights\n"
-
-
-class Window:
-  """Stands in for MuJoCo's passive viewer: presses a key at every second picture."""
-
-  def __init__(self, model, data, key_callback, **panels):
-    self.key, self.pictures = key_callback, 0
-    self.cam = types.SimpleNamespace(type=None, fixedcamid=-1)
-    self.opt = types.SimpleNamespace(flags=np.zeros(4, np.uint8))
-    self.user_scn = types.SimpleNamespace(flags=np.ones(4, np.uint8))
-    self.model, self.panels, self.closed = model, panels, False
-
-  lock = contextlib.nullcontext
-
-  def sync(self):
-    assert not self.opt.flags.any() and self.user_scn.flags.all()
-    self.pictures += 1
-    if self.pictures % 2:
-      self.key(ord("S"))
-      self.user_scn.flags[1], self.opt.flags[2] = False, True  # the viewer's own switches
-
-  def is_running(self):
-    return self.pictures < 25
-
-  def close(self):
-    self.closed = True
-
-
-@pytest.fixture
-def windows(monkeypatch):
-  """Every window that is opened."""
-  opened = []
-
-  def launch(*words, **keys):
-    opened.append(Window(*words, **keys))
-    return opened[-1]
-
-  monkeypatch.setattr("mujoco.viewer.launch_passive", launch)
-  monkeypatch.setenv("DISPLAY", ":0")
-  return opened
-
-
-def test_keyboard_moves_the_tool_in_front_of_the_laparoscope(tmp_path, windows):
-  words = ["exercise", "touch/easy", "--performer", "keyboard", "--no-report"]
-  assert cli.main([*words, "--out", str(tmp_path)]) == 0
-  (window,) = windows
-  assert window.cam.type == mujoco.mjtCamera.mjCAMERA_FIXED
-  assert window.cam.fixedcamid == window.model.camera("laparoscope").id
-  assert not any(window.panels.values()) and window.closed
-  recording = Recording.load(tmp_path / "recording.npz")
-  assert recording.info["performer"] == "keyboard" and len(recording.time) > 20
-  moved = recording.arrays["action"]
-  assert moved[2:, :].max() == 1.0  # inserted, by the key that was held
-
-
-def test_escape_ends_the_episode(tmp_path, windows, monkeypatch):
-  sync = Window.sync
-
-  def escape(self):
-    sync(self)
-    if self.pictures == 6:
-      self.key(256)
-
-  monkeypatch.setattr(Window, "sync", escape)
-  assert cli.main([*EASY, "--performer", "keyboard", "--out", "a"]) == 0
-  recording = Recording.load(tmp_path / "a" / "recording.npz")
-  assert recording.info["outcome"] == "stopped" and len(recording.time) == 1 + 6
-  assert windows[0].closed
-
-
-def test_closing_waits_for_the_window_to_go(windows, monkeypatch):
-  gone = []
-
-  class Slow(Window):
-    def __init__(self, *words, **keys):
-      super().__init__(*words, **keys)
-      self.leave = threading.Event()
-      threading.Thread(target=self.draw, daemon=True).start()
-
-    def draw(self):
-      self.leave.wait()
-      time.sleep(0.3)  # MuJoCo's window finishes a picture
-      gone.append(True)
-
-    def close(self):
-      self.leave.set()
-
-  monkeypatch.setattr("mujoco.viewer.launch_passive", Slow)
-  assert cli.main([*EASY, "--performer", "keyboard", "--out", "a"]) == 0
-  assert gone
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not shutil.which("Xvfb"), reason="needs Xvfb")
-def test_ctrl_c_in_the_window_ends_in_order(tmp_path):
-  server = subprocess.Popen(
-    ["Xvfb", "-displayfd", "1", "-screen", "0", "800x600x24"],
-    stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-  )  # fmt: skip
-  environment = os.environ | {"DISPLAY": f":{server.stdout.readline().strip()}"}
-  environment.pop("MUJOCO_GL", None)
-  command = [sys.executable, "-m", "palpate", *EASY, "--performer", "keyboard", "--out", "a"]
-  try:
-    for _ in range(5):
-      process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-      time.sleep(8)
-      process.send_signal(signal.SIGINT)
-      _, error = process.communicate(timeout=60)
-      assert process.returncode == 130, error
-  finally:
-    server.terminate()
-
-
-def test_keyboard_says_that_there_is_no_display(tmp_path, monkeypatch, capsys):
-  if not sys.platform.startswith("linux"):
-    pytest.skip("displays are asked for on Linux")
-  monkeypatch.delenv("DISPLAY", raising=False)
-  monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-  assert cli.main(["exercise", "touch/easy", "--performer", "keyboard", "--out", str(tmp_path)])
-  assert "no display to open a window on; use another performer" in capsys.readouterr().err

@@ -1,10 +1,18 @@
 """The exercises in Gymnasium."""
 
+import contextlib
 import ctypes.util
+import os
+import shutil
+import signal
 import subprocess
 import sys
+import threading
+import time
+import types
 import warnings
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -101,6 +109,113 @@ def test_rendering_without_a_screen_and_without_being_told_how(monkeypatch):
     "env.reset(seed=0)",
     "assert env.render().std() > 10",
   )
+
+
+class Viewer:
+  """Stands in for MuJoCo's passive viewer, whose own switches somebody turns."""
+
+  def __init__(self, model, data, **panels):
+    self.cam = types.SimpleNamespace(type=None, fixedcamid=-1)
+    self.opt = types.SimpleNamespace(flags=np.zeros(4, np.uint8))
+    self.user_scn = types.SimpleNamespace(flags=np.ones(4, np.uint8))
+    self.model, self.panels, self.pictures, self.closed = model, panels, 0, False
+
+  lock = contextlib.nullcontext
+
+  def sync(self):
+    assert not self.opt.flags.any() and self.user_scn.flags.all()
+    self.pictures += 1
+    self.user_scn.flags[1], self.opt.flags[2] = False, True
+
+  def is_running(self):
+    return True
+
+  def close(self):
+    self.closed = True
+
+
+@pytest.fixture
+def human(monkeypatch):
+  """An environment that draws for people, with a stand-in for the viewer."""
+  monkeypatch.setenv("DISPLAY", ":0")
+
+  def make(viewer=Viewer):
+    opened = []
+
+    def launch(*words, **keys):
+      opened.append(viewer(*words, **keys))
+      return opened[-1]
+
+    monkeypatch.setattr("mujoco.viewer.launch_passive", launch)
+    return gymnasium.make("palpate/TouchEasy-v0", render_mode="human"), opened
+
+  return make
+
+
+def test_human_looks_through_the_laparoscope(human):
+  env, windows = human()
+  env.reset(seed=0)
+  for _ in range(3):
+    env.step(np.zeros(4))
+  (window,) = windows
+  assert window.cam.type == mujoco.mjtCamera.mjCAMERA_FIXED and window.pictures == 4
+  assert window.cam.fixedcamid == window.model.camera("laparoscope").id
+  assert not any(window.panels.values())
+  env.close()
+  assert window.closed
+
+
+def test_closing_waits_for_the_window_to_go(human):
+  gone = []
+
+  class Slow(Viewer):
+    def __init__(self, *words, **keys):
+      super().__init__(*words, **keys)
+      self.leave = threading.Event()
+      threading.Thread(target=self.draw, daemon=True).start()
+
+    def draw(self):
+      self.leave.wait()
+      time.sleep(0.3)  # MuJoCo's window finishes a picture
+      gone.append(True)
+
+    def close(self):
+      self.leave.set()
+
+  env, _ = human(Slow)
+  env.reset(seed=0)
+  env.close()
+  assert gone
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("Xvfb"), reason="needs Xvfb")
+def test_ctrl_c_with_a_window_ends_in_order():
+  server = subprocess.Popen(
+    ["Xvfb", "-displayfd", "1", "-screen", "0", "800x600x24"],
+    stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+  )  # fmt: skip
+  environment = os.environ | {"DISPLAY": f":{server.stdout.readline().strip()}"}
+  environment.pop("MUJOCO_GL", None)
+  lines = (
+    "import gymnasium, numpy, palpate.tasks",
+    "env = gymnasium.make('palpate/TouchEasy-v0', render_mode='human')",
+    "env.reset(seed=0)",
+    "print('open', flush=True)",
+    "while True: env.step(numpy.zeros(4))",
+  )
+  command = [sys.executable, "-c", "\n".join(lines)]
+  try:
+    for _ in range(5):
+      process = subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+      )
+      assert process.stdout.readline() == "open\n"
+      process.send_signal(signal.SIGINT)
+      _, error = process.communicate(timeout=60)
+      assert process.returncode == -signal.SIGINT, error
+  finally:
+    server.terminate()
 
 
 def test_human_says_that_there_is_no_display(monkeypatch):
