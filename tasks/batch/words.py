@@ -8,6 +8,7 @@
 # pyright: reportOperatorIssue=false
 import dis
 import functools
+import itertools
 import types
 from typing import Any
 
@@ -389,10 +390,16 @@ def translate(rule: Any, module: Any, known: dict[Any, Any], used: set[Any]) -> 
     known[rule] = translate(rules.INSTEAD[rule], module, known, used)
     return known[rule]
   names = dict(rule.__globals__)
-  loaded = (step.argval for step in dis.get_instructions(rule) if step.opname == "LOAD_GLOBAL")
-  for name in loaded:
-    if isinstance(names.get(name), types.FunctionType):
-      names[name] = translate(names[name], module, known, used)
+  for step, following in itertools.pairwise(dis.get_instructions(rule)):
+    name, part = step.argval, following.argval
+    found = names.get(name) if step.opname == "LOAD_GLOBAL" else None
+    if isinstance(found, types.FunctionType):
+      names[name] = translate(found, module, known, used)
+    elif isinstance(found, types.ModuleType):
+      word = getattr(found, part)
+      if isinstance(word, types.FunctionType):
+        names[name] = types.ModuleType(name)
+        vars(names[name]).update(vars(found) | {part: translate(word, module, known, used)})
   code = rule.__code__
   copy = types.FunctionType(code, names, rule.__name__, rule.__defaults__, rule.__closure__)
   copy.__annotations__ = dict.fromkeys(code.co_varnames[: code.co_argcount], Any)

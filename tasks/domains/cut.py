@@ -27,31 +27,9 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array, ints
 
+from ..core import rules as r
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
-from ..core.rules import (
-  DAMAGED,
-  FAR,
-  HIDDEN,
-  LATER,
-  NOW,
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  Vectors3,
-  closeness,
-  cutter,
-  length,
-  many,
-  miss,
-  pieces,
-  root,
-  rows,
-  tip,
-  tissue_force,
-  vector,
-)
 from ..core.scenes import Scene
 from ..registry import exercise
 from . import sheet
@@ -134,12 +112,12 @@ class State:
   traction: float  # pull along the sheet [N]
   pulled: float  # the largest so far [N]
   inside: bool  # whether the edge was in the tissue a control step ago
-  seat: Vector  # where it was then [m]
+  seat: r.Vector  # where it was then [m]
   travelled: float  # and how far it had come [m]
   distance0: float  # [m]
   nearest: float  # best closeness so far
-  target: Vector
-  ahead: Vectors3
+  target: r.Vector
+  ahead: r.Vectors3
   covered: float
   deviation: float
 
@@ -162,12 +140,12 @@ def nearest(o, place):
   return k, float(far[k])
 
 
-@many(nearest)
+@r.many(nearest)
 def _nearest(o, place):
-  found, least = int(0), float(FAR)
+  found, least = int(0), float(r.FAR)
   for k in range(o.count):
     x, y = o.curve[k][0] - place[0], o.curve[k][1] - place[1]
-    far = root(x * x + y * y)
+    far = r.root(x * x + y * y)
     if far < least:
       least = far
       found = k
@@ -176,7 +154,7 @@ def _nearest(o, place):
 
 def distance(s, o):
   """Returns how far the tip is from the next point of the line [m]."""
-  return length(o.curve[o.next] - tip(s))
+  return r.length(o.curve[o.next] - r.tip(s))
 
 
 def cover(o, first, last):
@@ -199,8 +177,8 @@ def cover(o, first, last):
 
 def pull(s):
   """Returns the pull along the sheet, which lies in z = 0 [N]."""
-  force = tissue_force(s)
-  return root(force[0] * force[0] + force[1] * force[1])
+  force = r.tissue_force(s)
+  return r.root(force[0] * force[0] + force[1] * force[1])
 
 
 def proceed(s, o, start, end, way):
@@ -208,7 +186,7 @@ def proceed(s, o, start, end, way):
   first, before = nearest(o, start)
   last, off = nearest(o, end)
   if off > o.tolerance and (before <= o.tolerance or not o.inside):
-    miss(s, o, off)
+    r.miss(s, o, off)
   o.opened = o.opened + way
   o.excess = o.excess + off * way
   o.mean = o.excess / o.opened
@@ -226,29 +204,29 @@ def advance(s, o):
   """Follows the edge through the tissue."""
   o.traction = pull(s)
   o.pulled = max(o.pulled, o.traction)
-  inside, travelled, seat = cutter(s)
+  inside, travelled, seat = r.cutter(s)
   if inside and travelled > o.travelled:
     o = proceed(s, o, o.seat if o.inside else seat, seat, travelled - o.travelled)
-    o.deepest = max(o.deepest, -tip(s)[2])
+    o.deepest = max(o.deepest, -r.tip(s)[2])
   o.inside = inside
   o.seat = seat
   o.travelled = travelled
   if o.astray > ASTRAY or o.traction > 2.0 * o.limit:
-    return o, -1.0, DAMAGED
+    return o, -1.0, r.DAMAGED
   if o.covered >= COVERED:
-    if o.opened > o.length + CLOSING or pieces(s) > 1:
-      return o, 1.0, SUCCESS
-    here, _ = nearest(o, tip(s))  # the piece hangs together still: the cut goes on
+    if o.opened > o.length + CLOSING or r.pieces(s) > 1:
+      return o, 1.0, r.SUCCESS
+    here, _ = nearest(o, r.tip(s))  # the piece hangs together still: the cut goes on
     o.next = (here + 1) % o.count
-  o.nearest = max(o.nearest, closeness(distance(s, o), o.distance0))
-  return o, 0.1 * o.nearest + 0.9 * o.covered, RUNNING
+  o.nearest = max(o.nearest, r.closeness(distance(s, o), o.distance0))
+  return o, 0.1 * o.nearest + 0.9 * o.covered, r.RUNNING
 
 
 def observe(s, o):
   """Finds target, ahead and deviation; covered is up to date."""
-  k, n, here = o.next, o.count, tip(s)
+  k, n, here = o.next, o.count, r.tip(s)
   o.target = o.curve[k] - here
-  o.ahead = rows(
+  o.ahead = r.rows(
     o.curve[(k + FIRST) % n] - here,
     o.curve[(k + SECOND) % n] - here,
     o.curve[(k + THIRD) % n] - here,
@@ -261,8 +239,8 @@ def mark(s, o, k):
   """Marks the line where it is not cut: there are the lips of the cut."""
   at = k * o.count // MARKS
   further = (at - o.next + o.count) % o.count
-  look = NOW if MARKS * further < LEAD * o.count else LATER
-  return o.curve[at] + vector(0.0, 0.0, ABOVE), HIDDEN if o.cut[at] > 0 else look
+  look = r.NOW if MARKS * further < LEAD * o.count else r.LATER
+  return o.curve[at] + r.vector(0.0, 0.0, ABOVE), r.HIDDEN if o.cut[at] > 0 else look
 
 
 class Cut(Task):
@@ -271,7 +249,7 @@ class Cut(Task):
   watch = ("miss", "unintended_contact")
   mark_radius = 0.0009
   targets = MARKS
-  rules = Rules(
+  rules = r.Rules(
     State,
     advance,
     observe,
@@ -346,7 +324,7 @@ class Cut(Task):
     self.count, self.cut = len(self.curve), np.zeros(len(self.curve), bool)
     self.opened = self.astray = self.jagged = self.excess = self.mean = self.farthest = 0.0
     self.deepest = self.traction = self.pulled = 0.0
-    self.inside, self.travelled, self.seat = cutter(physics)
+    self.inside, self.travelled, self.seat = r.cutter(physics)
     self.done, self.next, self.covered, self.nearest = 0, 0, 0.0, 0.0
     self.distance0 = distance(physics, self)
     self.reference_length = self.length + self.distance0
@@ -371,8 +349,8 @@ class Cut(Task):
 
   def _goes_on(self, physics: Physics) -> bool:
     """Returns whether somebody else was cutting along the line."""
-    inside, _, seat = cutter(physics)
-    off = length(self.curve[self.next] - seat)
+    inside, _, seat = r.cutter(physics)
+    off = r.length(self.curve[self.next] - seat)
     return inside and off < 2 * self.tolerance
 
   def expert(self, p: Performer) -> Script:
@@ -390,7 +368,7 @@ class Cut(Task):
         yield from p.move(self.curve[start] + _OVER * up)
       yield from p.line(under(self.curve[start], _DEEP), speed=0.02)
       for _ in range(100):  # the sheet gives before it is pierced
-        if cutter(physics)[0]:
+        if r.cutter(physics)[0]:
           break
         p.tip = p.tip - 0.01 * self.control_timestep * up
         yield p.step()

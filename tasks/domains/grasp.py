@@ -33,32 +33,9 @@ import itertools
 
 import numpy as np
 
+from ..core import rules as r
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
-from ..core.rules import (
-  LATER,
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  clamp,
-  closeness,
-  closing,
-  dot,
-  drop,
-  from_tip,
-  grip,
-  holds,
-  length,
-  miss,
-  opening,
-  peak,
-  pinch,
-  point,
-  root,
-  slipped,
-  tip,
-)
 from ..core.scenes import Scene
 from ..registry import exercise
 from .touch import SLACK
@@ -111,9 +88,9 @@ class Held:
   control_timestep: float  # [s]
   site: int  # triangle to grasp
   closing: bool  # whether the jaws are told to close
-  where: Vector  # the site in the frame of the tip, where it was grasped [m]
+  where: r.Vector  # the site in the frame of the tip, where it was grasped [m]
   distance0: float  # [m]
-  target: Vector
+  target: r.Vector
   grasped: float  # 1 while the jaws hold it
 
 
@@ -127,46 +104,46 @@ def ready(s, o):
   press on a site push it ahead of them. Beside it they sink in and leave it behind their tips, so
   a site that closed jaws have within is nearer to their axis.
   """
-  off, wide = from_tip(s, point(s, o.site)), clamp(opening(s), 0.0, 1.0)
+  off, wide = r.from_tip(s, r.point(s, o.site)), r.clamp(r.opening(s), 0.0, 1.0)
   side = ASIDE * (0.6 + 0.4 * wide)
-  within = clamp(off[2] / OVER, 0.0, 1.0) * clamp(2.0 - aside(s, o) / side, 0.0, 1.0)
+  within = r.clamp(off[2] / OVER, 0.0, 1.0) * r.clamp(2.0 - aside(s, o) / side, 0.0, 1.0)
   return 0.4 * max(near(s, o), 0.0) * max(wide, within) + 0.6 * within * (1.0 - 0.6 * wide)
 
 
 def distance(s, o):
   """Returns how far the tip is from the site [m]."""
-  return length(point(s, o.site) - tip(s))
+  return r.length(r.point(s, o.site) - r.tip(s))
 
 
 def aside(s, o):
   """Returns how far the site is from the axis of the shaft [m]."""
-  off = from_tip(s, point(s, o.site))
-  return root(off[0] * off[0] + off[1] * off[1])
+  off = r.from_tip(s, r.point(s, o.site))
+  return r.root(off[0] * off[0] + off[1] * off[1])
 
 
 def near(s, o):
   """Returns the closeness of the jaws to where they can hold the site [-]."""
-  return closeness(max(distance(s, o) - OVER, 0.0), o.distance0 - OVER)
+  return r.closeness(max(distance(s, o) - OVER, 0.0), o.distance0 - OVER)
 
 
 def slid(s, o):
   """Returns how far the site has moved in the jaws from where it was grasped [m]."""
-  return length(from_tip(s, point(s, o.site)) - o.where)
+  return r.length(r.from_tip(s, r.point(s, o.site)) - o.where)
 
 
 def follow(s, o):
   """Finds out whether the site is grasped; returns too whether it was until now, and is no more."""
-  told, far, before, now = closing(s), distance(s, o), o.grasped == 1.0, False
+  told, far, before, now = r.closing(s), distance(s, o), o.grasped == 1.0, False
   if before:
-    now = told and holds(s) and slid(s, o) < o.slip
+    now = told and r.holds(s) and slid(s, o) < o.slip
     if told and not now:
-      slipped(s, o)
-  elif told and far < REACH and aside(s, o) < ASIDE and holds(s):
+      r.slipped(s, o)
+  elif told and far < REACH and aside(s, o) < ASIDE and r.holds(s):
     now = True
-    o.where = from_tip(s, point(s, o.site))
-    grip(s, o, far)
+    o.where = r.from_tip(s, r.point(s, o.site))
+    r.grip(s, o, far)
   if told and not o.closing and far >= 2.0 * REACH:
-    miss(s, o, far)
+    r.miss(s, o, far)
   o.closing = told
   o.grasped = 1.0 if now else 0.0
   return o, before and not now
@@ -208,8 +185,8 @@ class State(Held):
 
   lift: float  # [m]
   hold: float  # [s]
-  rest: Vector  # the site's place at rest [m]
-  up: Vector  # towards the trocar
+  rest: r.Vector  # the site's place at rest [m]
+  up: r.Vector  # towards the trocar
   time: float  # held [s]
   done: bool  # it was held
   lowered: float  # it rests low [s]
@@ -223,7 +200,7 @@ class State(Held):
 
 def raised(s, o):
   """Returns how far the site is above its place at rest, towards the trocar [m]."""
-  return dot(point(s, o.site) - o.rest, o.up)
+  return r.dot(r.point(s, o.site) - o.rest, o.up)
 
 
 def again(o):
@@ -237,7 +214,7 @@ def again(o):
 
 def lose(s, o):
   """Counts a loss, and starts again."""
-  drop(s, o)
+  r.drop(s, o)
   return again(o)
 
 
@@ -246,11 +223,11 @@ def count(s, o, share):
   if not o.done:
     if share < 1.0:
       o.time = 0.0
-    elif peak(s) <= o.force_limit:
+    elif r.peak(s) <= o.force_limit:
       o.time = o.time + o.control_timestep
     if o.time >= o.hold - SLACK:
       o.done = True
-      o.where = from_tip(s, point(s, o.site))
+      o.where = r.from_tip(s, r.point(s, o.site))
   low = o.done and share >= LOW and share <= RESTING
   o.lowered = o.lowered + o.control_timestep if low else 0.0
   return o
@@ -266,8 +243,8 @@ def advance(s, o):
       o = lose(s, o)
   if o.letting and (share < LOW or share > LETTING):
     o = lose(s, o)
-  if o.letting and not holds(s):
-    return o, 1.0, SUCCESS
+  if o.letting and not r.holds(s):
+    return o, 1.0, r.SUCCESS
   if o.grasped == 1.0:
     o = count(s, o, share)
   high = max(min(share, 1.0), 0.0)
@@ -276,7 +253,7 @@ def advance(s, o):
     progress = 0.9 + 0.05 * (1.0 - high) + 0.03 * min(o.lowered / REST, 1.0)
   elif o.grasped == 1.0:
     progress = 0.3 + 0.4 * high + 0.2 * min(o.time / o.hold, 1.0)
-  return o, progress, RUNNING
+  return o, progress, r.RUNNING
 
 
 def shaping(s, o):
@@ -284,19 +261,19 @@ def shaping(s, o):
   if o.grasped == 0.0 and not o.done:
     return READY * ready(s, o)
   share = raised(s, o) / o.lift
-  high, pushed = clamp(share, 0.0, 1.0), max(-share, 0.0)
+  high, pushed = r.clamp(share, 0.0, 1.0), max(-share, 0.0)
   deep = 0.15 * pushed / (1.0 + pushed)
   if not o.done:
     return 0.26 - high * (0.16 + (0.12 - TIGHT) * min(o.time / o.hold, 1.0)) - deep
   loose = 0.0
   if o.lowered >= REST - SLACK:
-    loose = LOOSE * clamp(1.0 - 2.0 * pinch(s) / o.force_limit, 0.0, 1.0)
-  return TIGHT + HIGH * clamp(share, 0.0, 2.0) + loose - deep
+    loose = LOOSE * r.clamp(1.0 - 2.0 * r.pinch(s) / o.force_limit, 0.0, 1.0)
+  return TIGHT + HIGH * r.clamp(share, 0.0, 2.0) + loose - deep
 
 
 def observe(s, o):
   """Finds target, height and held; grasped is up to date."""
-  o.target = point(s, o.site) - tip(s)
+  o.target = r.point(s, o.site) - r.tip(s)
   o.height = raised(s, o) - o.lift
   o.held = min(o.time / o.hold, 1.0)
   return o
@@ -304,13 +281,13 @@ def observe(s, o):
 
 def mark(s, o, k):
   """Marks the site."""
-  return point(s, o.site), LATER
+  return r.point(s, o.site), r.LATER
 
 
 class Grasp(Hold):
   """Grasp, lift, hold, lower, release."""
 
-  rules = Rules(
+  rules = r.Rules(
     State, advance, observe, ("target", "height", "held", "grasped"), columns=GRIPS,
     shaping=shaping, mark=mark,
   )  # fmt: skip

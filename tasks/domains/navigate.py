@@ -26,29 +26,9 @@ import warp as wp
 from palpate.models import laparoscope, trocar
 from palpate.tissue.types import Array, ints
 
+from ..core import rules as r
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
-from ..core.rules import (
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  angle,
-  closeness,
-  dot,
-  drop,
-  guide,
-  guided_tip,
-  length,
-  lens,
-  normal,
-  picture,
-  point,
-  root,
-  shown,
-  sine,
-  vector,
-)
 from ..core.scenes import Scene
 from ..registry import exercise
 from .touch import SLACK, draw_apart
@@ -99,10 +79,10 @@ class State:
   control_timestep: float  # [s]
   goals: Annotated[Any, ints("marks")]  # triangles under the marks
   sides: Annotated[Any, Array(wp.vec3, ("marks",))]  # that they are to be seen from
-  middle: Vector  # of the instrument's joints pitch, yaw, insertion
-  swing: Vector
-  rate: Vector  # [rad/s]
-  phase: Vector  # [rad]
+  middle: r.Vector  # of the instrument's joints pitch, yaw, insertion
+  swing: r.Vector
+  rate: r.Vector  # [rad/s]
+  phase: r.Vector  # [rad]
   clock: float  # [s]
   done: int
   time: float  # shown [s]
@@ -114,8 +94,8 @@ class State:
   tilted: float  # and its sums
   beside: float
   outside: float
-  target: Vector
-  side: Vector
+  target: r.Vector
+  side: r.Vector
   held: float
   horizon_angle: float  # metrics so far
   off_centre: float
@@ -137,7 +117,7 @@ def follows(o):
 
 def mark_place(s, o, k):
   """Returns where a mark is [m]."""
-  return point(s, o.goals[k]) + ABOVE * normal(s, o.goals[k])
+  return r.point(s, o.goals[k]) + ABOVE * r.normal(s, o.goals[k])
 
 
 def now(o):
@@ -148,45 +128,45 @@ def now(o):
 def place(s, o):
   """Returns where that is which is to be shown [m]."""
   if follows(o):
-    return guided_tip(s)
+    return r.guided_tip(s)
   return mark_place(s, o, now(o))
 
 
 def in_picture(s, way):
   """Returns a direction of the world in the axes of the picture."""
-  axes = picture(s)
-  return vector(dot(axes[0], way), dot(axes[1], way), dot(axes[2], way))
+  axes = r.picture(s)
+  return r.vector(r.dot(axes[0], way), r.dot(axes[1], way), r.dot(axes[2], way))
 
 
 def aside(v):
   """Returns how far from the picture's axis a place is that `in_picture` tells [m]."""
-  return root(v[0] * v[0] + v[1] * v[1])
+  return r.root(v[0] * v[0] + v[1] * v[1])
 
 
 def short(o, v, side):
   """Returns what the cosine to the pin is short of its limit; nothing for the instrument."""
   if follows(o):
     return 0.0
-  return max(o.facing + dot(v, side) / max(length(v), 1e-6), 0.0)
+  return max(o.facing + r.dot(v, side) / max(r.length(v), 1e-6), 0.0)
 
 
 def error(o, v, side):
   """Returns how far what is shown is from how it is to be shown, see the head."""
-  far = length(v)
-  off = angle(aside(v), -v[2])
+  far = r.length(v)
+  off = r.angle(aside(v), -v[2])
   beyond = max(max(o.low - far, far - o.high), 0.0)
   return off + 0.2 * abs(o.horizon) + 10.0 * beyond + short(o, v, side)
 
 
 def look(s, o):
   """Sees whether what is to be shown is in the picture, in its middle, and level."""
-  axes = picture(s)
-  v = in_picture(s, place(s, o) - lens(s))
+  axes = r.picture(s)
+  v = in_picture(s, place(s, o) - r.lens(s))
   depth = -v[2]
   size = o.half * max(depth, 1e-6)
   o.seen = depth > 0.0 and abs(v[1]) <= size and abs(v[0]) <= 4.0 / 3.0 * size
   o.centred = depth > 0.0 and aside(v) <= o.centre * size
-  o.horizon = angle(axes[0][2], axes[1][2])
+  o.horizon = r.angle(axes[0][2], axes[1][2])
   return o, v
 
 
@@ -208,9 +188,9 @@ def advance(s, o):
   o = measure(o, half)
   o, v = look(s, o)
   if follows(o) and had and not o.seen:
-    drop(s, o)
+    r.drop(s, o)
   side = in_picture(s, o.sides[now(o)])
-  far = length(v)
+  far = r.length(v)
   near = o.low <= far and far <= o.high and short(o, v, side) == 0.0
   if o.centred and near and abs(o.horizon) <= o.tilt:
     o.time = o.time + o.control_timestep
@@ -230,30 +210,31 @@ def advance(s, o):
   o.off_centre = 100.0 * o.beside / o.total
   o.out_of_view = 100.0 * o.outside / o.total
   held = 0.4 * o.time / wanted
-  progress = (float(o.done) + 0.5 * closeness(error(o, v, side), o.error0) + held) / float(count(o))
-  return o, progress, SUCCESS if o.done == count(o) else RUNNING
+  close = 0.5 * r.closeness(error(o, v, side), o.error0)
+  progress = (float(o.done) + close + held) / float(count(o))
+  return o, progress, r.SUCCESS if o.done == count(o) else r.RUNNING
 
 
 def act(s, o):
   """Moves the instrument on."""
   if o.follow > 0.0:
     o.clock = o.clock + o.control_timestep
-    guide(s, joints(o))
+    r.guide(s, joints(o))
   return o
 
 
 def joints(o):
   """Returns where the instrument's pitch, yaw and insertion are to be."""
   turn = o.clock * o.rate + o.phase
-  return o.middle + vector(
-    o.swing[0] * sine(turn[0]), o.swing[1] * sine(turn[1]), o.swing[2] * sine(turn[2])
+  return o.middle + r.vector(
+    o.swing[0] * r.sine(turn[0]), o.swing[1] * r.sine(turn[1]), o.swing[2] * r.sine(turn[2])
   )
 
 
 def observe(s, o):
   """Finds target, side and held; horizon is up to date."""
-  o.target = in_picture(s, place(s, o) - lens(s))
-  o.side = vector(0.0, 0.0, 0.0)
+  o.target = in_picture(s, place(s, o) - r.lens(s))
+  o.side = r.vector(0.0, 0.0, 0.0)
   if o.facing > -1.0 and not follows(o):
     o.side = in_picture(s, o.sides[now(o)])
   o.held = o.time / (o.follow if follows(o) else o.hold)
@@ -266,13 +247,13 @@ def mark(s, o, k):
   at = mark_place(s, o, of)
   if k % o.per == 1:
     at = at + PIN * o.sides[of]
-  return at, shown(of, o.done)
+  return at, r.shown(of, o.done)
 
 
 class Navigate(Task):
   """Show marks with a laparoscope."""
 
-  rules = Rules(
+  rules = r.Rules(
     State,
     advance,
     observe,
@@ -362,8 +343,8 @@ class Navigate(Task):
   def instruct(self, physics: Physics) -> str:
     """Says what is wrong with the picture, the worst first."""
     what = "the instrument" if follows(self) else "the yellow mark"
-    way = in_picture(physics, place(physics, self) - lens(physics))
-    far, number = length(way), f"{min(self.done + 1, count(self))} of {count(self)}"
+    way = in_picture(physics, place(physics, self) - r.lens(physics))
+    far, number = r.length(way), f"{min(self.done + 1, count(self))} of {count(self)}"
     if not self.seen:
       return f"Find {what}, {number}"
     if not self.centred:
@@ -394,7 +375,7 @@ class Navigate(Task):
     far = 0.5 * (self.low + self.high)
     while self.outcome is None and self.follow:
       # From where it looks already: the scope need not be rolled.
-      side, goal = picture(physics)[2], guided_tip(physics)
+      side, goal = r.picture(physics)[2], r.guided_tip(physics)
       pose = laparoscope.show(physics.trocar(), goal, far, side, physics.optics)
       way = laparoscope.view(physics.trocar(), pose, physics.optics)[0] - p.tip
       most = 0.05 * p.style.speed * p.dt

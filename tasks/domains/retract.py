@@ -23,23 +23,9 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array
 
+from ..core import rules as r
 from ..core.base import Physics
 from ..core.performer import Performer, Script
-from ..core.rules import (
-  LATER,
-  NOW,
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  clamp,
-  dot,
-  drop,
-  peak,
-  point,
-  tip,
-  visible,
-)
 from ..core.scenes import Scene
 from ..registry import exercise
 from .grasp import FUNDUS, GRIPS, READY, Held, Hold, follow, near, ready
@@ -79,11 +65,11 @@ class State(Held):
   wanted: float  # share of the disc
   hold: float  # [s]
   radius: float  # of the disc [m]
-  rest: Vector  # the site's place at rest [m]
-  right: Vector  # where to pull it aside to
+  rest: r.Vector  # the site's place at rest [m]
+  right: r.Vector  # where to pull it aside to
   disc: Annotated[Any, Array(wp.vec3, (SAMPLES,))]  # points of it [m]
   time: float  # held [s]
-  hidden: Vector
+  hidden: r.Vector
   visible: float
   held: float
 
@@ -93,26 +79,26 @@ class State(Held):
 
 def pulled(s, o):
   """Returns how far the site has come aside, as a share of four radii of the disc [-]."""
-  return clamp(dot(point(s, o.site) - o.rest, o.right) / (4.0 * o.radius), -1.0, 1.0)
+  return r.clamp(r.dot(r.point(s, o.site) - o.rest, o.right) / (4.0 * o.radius), -1.0, 1.0)
 
 
 def advance(s, o):
   """Follows the grasp and what is seen."""
   o, lost = follow(s, o)
   if lost:
-    drop(s, o)
-  o.visible = visible(s, o)
+    r.drop(s, o)
+  o.visible = r.visible(s, o)
   if o.visible < o.wanted - SEEN or o.grasped == 0.0:
     o.time = 0.0
-  elif peak(s) <= o.force_limit:
+  elif r.peak(s) <= o.force_limit:
     o.time = o.time + o.control_timestep
   if o.time >= o.hold - SLACK:
-    return o, 1.0, SUCCESS
+    return o, 1.0, r.SUCCESS
   progress = 0.15 * near(s, o)
   if o.grasped == 1.0:
     seen = min(o.visible / o.wanted, 1.0)
     progress = 0.3 + 0.1 * pulled(s, o) + 0.4 * seen + 0.2 * o.time / o.hold
-  return o, progress, RUNNING
+  return o, progress, r.RUNNING
 
 
 def shaping(s, o):
@@ -124,8 +110,8 @@ def shaping(s, o):
 
 def observe(s, o):
   """Finds target, hidden and held; visible and grasped are up to date."""
-  o.target = point(s, o.site) - tip(s)
-  o.hidden = o.disc[0] - tip(s)
+  o.target = r.point(s, o.site) - r.tip(s)
+  o.hidden = o.disc[0] - r.tip(s)
   o.held = min(o.time / o.hold, 1.0)
   return o
 
@@ -133,14 +119,14 @@ def observe(s, o):
 def mark(s, o, k):
   """Marks what the organ hides, and the site."""
   if k == 0:
-    return o.disc[0], NOW
-  return point(s, o.site), LATER
+    return o.disc[0], r.NOW
+  return r.point(s, o.site), r.LATER
 
 
 class Retract(Hold):
   """Pull tissue aside and hold it."""
 
-  rules = Rules(
+  rules = r.Rules(
     State, advance, observe, ("target", "hidden", "visible", "held", "grasped"),
     columns=GRIPS, shaping=shaping, mark=mark,
   )  # fmt: skip

@@ -15,23 +15,9 @@ from typing import Annotated, Any
 import numpy as np
 from palpate.tissue.types import ints
 
+from ..core import rules as r
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
-from ..core.rules import (
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  closeness,
-  length,
-  miss,
-  normal,
-  peak,
-  point,
-  reach,
-  shown,
-  tip,
-)
 from ..core.scenes import Scene
 from ..registry import exercise
 
@@ -71,8 +57,8 @@ class State:
   pressing: bool
   spoilt: bool  # the contact counts no more
   distance0: float  # [m]
-  target: Vector
-  normal: Vector
+  target: r.Vector
+  normal: r.Vector
   held: float
 
 
@@ -86,7 +72,7 @@ def goal(o):
 
 def distance(s, o):
   """Returns how far the tip is from the point to touch [m]."""
-  return length(point(s, goal(o)) - tip(s))
+  return r.length(r.point(s, goal(o)) - r.tip(s))
 
 
 def follow(s, o, far):
@@ -95,11 +81,11 @@ def follow(s, o, far):
   That is until the tip lets go.
   """
   on = far <= o.tolerance
-  pressing = peak(s) > CONTACT
+  pressing = r.peak(s) > CONTACT
   if pressing and not o.pressing and not on:
-    miss(s, o, far)
+    r.miss(s, o, far)
   o.pressing = pressing
-  o.spoilt = pressing and (o.spoilt or not on or peak(s) > o.force_limit)
+  o.spoilt = pressing and (o.spoilt or not on or r.peak(s) > o.force_limit)
   o.time = o.time + o.control_timestep if pressing and not o.spoilt else 0.0
   return o
 
@@ -109,35 +95,35 @@ def advance(s, o):
   far = distance(s, o)
   o = follow(s, o, far)
   if o.time >= DWELL - SLACK:
-    reach(s, o, far)
+    r.reach(s, o, far)
     o.done = o.done + 1
     o.time = 0.0
     o.spoilt = True
     far = distance(s, o)
     o.distance0 = far
-  outcome = SUCCESS if o.done == o.goals.shape[0] else RUNNING
-  near = closeness(far, o.distance0)
+  outcome = r.SUCCESS if o.done == o.goals.shape[0] else r.RUNNING
+  near = r.closeness(far, o.distance0)
   progress = (float(o.done) + 0.5 * near + 0.2 * o.time / DWELL) / float(o.goals.shape[0])
   return o, progress, outcome
 
 
 def observe(s, o):
   """Finds target, normal and held."""
-  o.target = point(s, goal(o)) - tip(s)
-  o.normal = normal(s, goal(o))
+  o.target = r.point(s, goal(o)) - r.tip(s)
+  o.normal = r.normal(s, goal(o))
   o.held = o.time / DWELL
   return o
 
 
 def mark(s, o, k):
   """Marks the points that are left."""
-  return point(s, o.goals[k]), shown(k, o.done)
+  return r.point(s, o.goals[k]), r.shown(k, o.done)
 
 
 class Touch(Task):
   """Touch points in order."""
 
-  rules = Rules(State, advance, observe, ("target", "normal", "held"), mark=mark)
+  rules = r.Rules(State, advance, observe, ("target", "normal", "held"), mark=mark)
 
   def __init__(self, points: int, tolerance: float, scene: Scene, random=None, **kwargs):
     """Makes the task.

@@ -22,30 +22,9 @@ import scipy
 import warp as wp
 from palpate.tissue.types import Array, floats, ints
 
+from ..core import rules as r
 from ..core.base import Physics, Task
 from ..core.performer import Performer, Script
-from ..core.rules import (
-  FAR,
-  HIDDEN,
-  LATER,
-  NOW,
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  Vectors3,
-  clamp,
-  closeness,
-  corner,
-  dot,
-  drop,
-  force,
-  length,
-  many,
-  miss,
-  rows,
-  tip,
-)
 from ..core.scenes import Scene
 from ..registry import exercise
 
@@ -98,8 +77,8 @@ class State:
   tracing: bool
   touching: bool
   distance0: float  # [m]
-  target: Vector
-  ahead: Vectors3
+  target: r.Vector
+  ahead: r.Vectors3
 
 
 # The rules. What goes over many points is written for numpy, and for many worlds below it.
@@ -112,7 +91,7 @@ def settle(s, o):
   return o
 
 
-@many(settle)
+@r.many(settle)
 def _settle(s, o):
   return o
 
@@ -122,10 +101,10 @@ def place(s, o, k):
   return o.now[k]
 
 
-@many(place)
+@r.many(place)
 def _place(s, o, k):
   t, share = o.triangles[k], o.weights[k]
-  return share[0] * corner(s, t, 0) + share[1] * corner(s, t, 1) + share[2] * corner(s, t, 2)
+  return share[0] * r.corner(s, t, 0) + share[1] * r.corner(s, t, 1) + share[2] * r.corner(s, t, 2)
 
 
 def done(o):
@@ -133,7 +112,7 @@ def done(o):
   return int(np.searchsorted(o.arc, o.traced, side="right")) if o.traced else 0
 
 
-@many(done)
+@r.many(done)
 def _done(o):
   found = int(0)
   if o.traced > 0.0:
@@ -149,7 +128,7 @@ def project(s, o):
   part = slice(max(k - WINDOW, 0), k + WINDOW + 1)
   start, arc = o.now[part], o.arc[part]
   along = np.diff(start, axis=0)
-  offset = tip(s) - start[:-1]
+  offset = r.tip(s) - start[:-1]
   share = np.einsum("ij,ij->i", offset, along) / np.einsum("ij,ij->i", along, along)
   share = np.clip(share, 0.0, 1.0)
   off = np.linalg.norm(offset - share[:, None] * along, axis=1)
@@ -157,15 +136,15 @@ def project(s, o):
   return float(arc[i] + share[i] * (arc[i + 1] - arc[i])), float(off[i])
 
 
-@many(project)
+@r.many(project)
 def _project(s, o):
   middle = max(done(o) - 1, 0)
-  along_curve, off = float(0.0), float(FAR)
+  along_curve, off = float(0.0), float(r.FAR)
   for k in range(max(middle - WINDOW, 0), min(middle + WINDOW, o.count - 1)):
     start = place(s, o, k)
     along = place(s, o, k + 1) - start
-    share = clamp(dot(tip(s) - start, along) / dot(along, along), 0.0, 1.0)
-    far = length(tip(s) - start - share * along)
+    share = r.clamp(r.dot(r.tip(s) - start, along) / r.dot(along, along), 0.0, 1.0)
+    far = r.length(r.tip(s) - start - share * along)
     if far < off:
       off = far
       along_curve = o.arc[k] + share * (o.arc[k + 1] - o.arc[k])
@@ -174,20 +153,20 @@ def _project(s, o):
 
 def aside(s, o):
   """Returns how far the tip is from the nearest point of the curve [m]."""
-  return float(scipy.spatial.KDTree(o.now).query(tip(s))[0])
+  return float(scipy.spatial.KDTree(o.now).query(r.tip(s))[0])
 
 
-@many(aside)
+@r.many(aside)
 def _aside(s, o):
-  off = float(FAR)
+  off = float(r.FAR)
   for k in range(o.count):
-    off = min(off, length(place(s, o, k) - tip(s)))
+    off = min(off, r.length(place(s, o, k) - r.tip(s)))
   return off
 
 
 def distance(s, o):
   """Returns how far the tip is from the next point of the curve [m]."""
-  return length(place(s, o, min(done(o), o.count - 1)) - tip(s))
+  return r.length(place(s, o, min(done(o), o.count - 1)) - r.tip(s))
 
 
 def follow(
@@ -224,7 +203,7 @@ def advance(s, o):
   """Follows the tip along the curve."""
   o = settle(s, o)
   whole = o.arc[o.count - 1]
-  touches = force(s) > CONTACT
+  touches = r.force(s) > CONTACT
   along, off = project(s, o)
   on = touches and off <= o.tolerance
   tracing, traced, skipped = follow(o.tracing, o.traced, o.skipped, along, on, o.tolerance, whole)
@@ -232,29 +211,29 @@ def advance(s, o):
   o.traced = traced
   o.skipped = skipped
   if o.touching and not touches and traced > 0.0:
-    drop(s, o)
+    r.drop(s, o)
   if touches and not o.touching:
     beside = aside(s, o)
     if beside > o.tolerance:
-      miss(s, o, beside)
+      r.miss(s, o, beside)
   o.touching = touches
   if traced >= whole - STEP:
-    return o, 1.0, SUCCESS
-  return o, 0.1 * closeness(distance(s, o), o.distance0) + 0.9 * traced / whole, RUNNING
+    return o, 1.0, r.SUCCESS
+  return o, 0.1 * r.closeness(distance(s, o), o.distance0) + 0.9 * traced / whole, r.RUNNING
 
 
 def shaping(s, o):
   """Returns what tells the way to the curve, and to stay on it."""
   left = 1.0 - o.traced / o.arc[o.count - 1]
   on = 0.1 if o.tracing else 0.0
-  return left * (0.15 * closeness(distance(s, o), o.distance0) + on)
+  return left * (0.15 * r.closeness(distance(s, o), o.distance0) + on)
 
 
 def observe(s, o):
   """Finds target and ahead."""
-  at, last, here = done(o), o.count - 1, tip(s)
+  at, last, here = done(o), o.count - 1, r.tip(s)
   o.target = place(s, o, min(at, last)) - here
-  o.ahead = rows(
+  o.ahead = r.rows(
     place(s, o, min(at + FIRST, last)) - here,
     place(s, o, min(at + SECOND, last)) - here,
     place(s, o, min(at + THIRD, last)) - here,
@@ -271,8 +250,8 @@ def mark(s, o, k):
   """Marks what is left of the curve, and where to begin or to go on."""
   at, first = marked(o, k), min(done(o), o.count - 1)
   begins = at >= first and (k < LEAD or marked(o, max(k - LEAD, 0)) < first)
-  look = LATER if at >= first else HIDDEN
-  return place(s, o, at), NOW if begins else look
+  look = r.LATER if at >= first else r.HIDDEN
+  return place(s, o, at), r.NOW if begins else look
 
 
 class Trace(Task):
@@ -281,7 +260,7 @@ class Trace(Task):
   watch = ("miss", "unintended_contact", "drop")
   mark_radius = 0.0015
   targets = MARKS
-  rules = Rules(State, advance, observe, ("target", "ahead"), shaping=shaping, mark=mark)
+  rules = r.Rules(State, advance, observe, ("target", "ahead"), shaping=shaping, mark=mark)
 
   def __init__(
     self, scene: Scene, random=None, *, size: float, turns: float, tolerance: float, **kwargs

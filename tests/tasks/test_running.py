@@ -6,7 +6,7 @@ import palpate
 import pytest
 from palpate.models import wrist
 from palpate.tasks import suite
-from palpate.tasks.core import episode, performer, stage
+from palpate.tasks.core import episode, performer, rules, stage
 from palpate.tasks.domains import sheet
 from palpate.tasks.domains.suturing import running
 from palpate.tasks.recording import Recording
@@ -82,9 +82,9 @@ def test_who_lets_go_has_missed(easy):
 @pytest.mark.parametrize(
   ("changed", "outcome"),
   [
-    ({"done": 4, "gap0": 0.002}, running.MISSED),  # a stitch is gone
-    ({"tolerance": 1e-4, "placed": 0, "misses": np.full(8, 2e-4)}, running.MISSED),
-    ({"close": 0.01, "closed": 0.49}, running.RUNNING),  # closed, but not placed
+    ({"done": 4, "gap0": 0.002}, rules.MISSED),  # a stitch is gone
+    ({"tolerance": 1e-4, "placed": 0, "misses": np.full(8, 2e-4)}, rules.MISSED),
+    ({"close": 0.01, "closed": 0.49}, rules.RUNNING),  # closed, but not placed
   ],
 )
 def test_what_does_not_count(easy, monkeypatch, changed, outcome):

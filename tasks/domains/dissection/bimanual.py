@@ -25,28 +25,9 @@ import mujoco
 import numpy as np
 from palpate.engine.cutting.trails import SPARK
 
+from ...core import rules as r
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.rules import (
-  DAMAGED,
-  FAR,
-  RUNNING,
-  Rules,
-  Vector,
-  bond,
-  bonds,
-  dot,
-  is_free,
-  last_component,
-  length,
-  many,
-  other_force,
-  other_point,
-  other_tip,
-  point,
-  strand_distance,
-  weaken,
-)
 from ...registry import exercise
 from ..grasp import FUNDUS
 from . import dissect
@@ -102,17 +83,17 @@ def hard(**kwargs):
 class State(dissect.State):
   """State of a world."""
 
-  heel: Vector  # end of the axis of the hook's wire, in the frame of its tip [m]
-  toe: Vector  # the other end [m]
+  heel: r.Vector  # end of the axis of the hook's wire, in the frame of its tip [m]
+  toe: r.Vector  # the other end [m]
   reach: float  # of the current from that axis [m]
-  rest: Vector  # the site's place at rest [m]
-  away: Vector  # from the bed
+  rest: r.Vector  # the site's place at rest [m]
+  away: r.Vector  # from the bed
   live: bool  # whether the current is on
   time: float  # how long it has burnt what the hook touches, less what has cooled [s]
   powered: float  # how long it was on [s]
   wasted: float  # with no bond in reach [s]
   aim: int  # bond to divide next
-  hook_front: Vector
+  hook_front: r.Vector
   hook_gap: float
   retracted: float
   burnt: float
@@ -123,17 +104,17 @@ class State(dissect.State):
 
 def retraction(s, o):
   """Returns how far the site is from its place at rest, away from the bed [m]."""
-  return dot(point(s, o.site) - o.rest, o.away)
+  return r.dot(r.point(s, o.site) - o.rest, o.away)
 
 
 def fair(s, o):
   """Returns whether what comes free now is held away from the bed, and divided gently."""
-  return o.grasped == 1.0 and retraction(s, o) > AWAY and other_force(s) <= HOOK_LIMIT
+  return o.grasped == 1.0 and retraction(s, o) > AWAY and r.other_force(s) <= HOOK_LIMIT
 
 
 def distances(s, o) -> np.ndarray:
   """Returns how far the bonds that hold are from the wire [m]  (n,); free ones are far away."""
-  far = s.organ.bonds.distance(other_point(s, o.heel), other_point(s, o.toe))
+  far = s.organ.bonds.distance(r.other_point(s, o.heel), r.other_point(s, o.toe))
   return np.where(s.organ.bonds.free, np.inf, far)
 
 
@@ -145,13 +126,13 @@ def divide(s, o):
   return bool(near.any())
 
 
-@many(divide)
+@r.many(divide)
 def _divide(s, o):
   found = int(0)
-  for k in range(bonds(s)):
-    far = strand_distance(s, k, other_point(s, o.heel), other_point(s, o.toe))
-    if far < o.reach and not is_free(s, k):
-      weaken(s, k, RATE * o.control_timestep)
+  for k in range(r.bonds(s)):
+    far = r.strand_distance(s, k, r.other_point(s, o.heel), r.other_point(s, o.toe))
+    if far < o.reach and not r.is_free(s, k):
+      r.weaken(s, k, RATE * o.control_timestep)
       found += 1
   return found > 0
 
@@ -161,28 +142,28 @@ def gap(s, o):
   return min(float(distances(s, o).min()) - o.reach, ASIDE)
 
 
-@many(gap)
+@r.many(gap)
 def _gap(s, o):
   least = float(ASIDE)
-  for k in range(bonds(s)):
-    if not is_free(s, k):
-      far = strand_distance(s, k, other_point(s, o.heel), other_point(s, o.toe)) - o.reach
+  for k in range(r.bonds(s)):
+    if not r.is_free(s, k):
+      far = r.strand_distance(s, k, r.other_point(s, o.heel), r.other_point(s, o.toe)) - o.reach
       least = min(least, far)
   return least
 
 
 def nearest(s):
   """Returns which bond of those that hold is nearest to the hook's tip."""
-  far = np.linalg.norm(s.organ.bonds.positions - other_tip(s), axis=1)
+  far = np.linalg.norm(s.organ.bonds.positions - r.other_tip(s), axis=1)
   return int(np.where(s.organ.bonds.free, np.inf, far).argmin())
 
 
-@many(nearest)
+@r.many(nearest)
 def _nearest(s):
-  found, least = int(0), float(FAR)
-  for k in range(bonds(s)):
-    far = length(bond(s, k) - other_tip(s))
-    if far < least and not is_free(s, k):
+  found, least = int(0), float(r.FAR)
+  for k in range(r.bonds(s)):
+    far = r.length(r.bond(s, k) - r.other_tip(s))
+    if far < least and not r.is_free(s, k):
       least = far
       found = k
   return found
@@ -190,13 +171,13 @@ def _nearest(s):
 
 def act(s, o):
   """Sends the current through the hook: it divides, or burns what the hook touches."""
-  o.live = last_component(s, o) > 0.0
+  o.live = r.last_component(s, o) > 0.0
   burns = False
   if o.live:
     o.powered = o.powered + o.control_timestep
     if not divide(s, o):
       o.wasted = o.wasted + o.control_timestep
-      burns = other_force(s) > TOUCHING
+      burns = r.other_force(s) > TOUCHING
   o.time = max(o.time + o.control_timestep * (1.0 if burns else -COOLING), 0.0)
   return o
 
@@ -205,17 +186,17 @@ def advance(s, o):
   """Follows the grasp, what comes free, and what is burnt."""
   o, near = hold(s, o)
   o, outcome = count(s, o, fair(s, o))
-  if is_free(s, o.aim):
+  if r.is_free(s, o.aim):
     o.aim = nearest(s)
-  if outcome == RUNNING and (o.time > BURN or other_force(s) > HOOK_DAMAGE):
-    outcome = DAMAGED
+  if outcome == r.RUNNING and (o.time > BURN or r.other_force(s) > HOOK_DAMAGE):
+    outcome = r.DAMAGED
   return o, earned(o, near, outcome), outcome
 
 
 def observe(s, o):
   """Finds what `dissect` does, hook_front, hook_gap, retracted and burnt."""
   o = look(s, o)
-  o.hook_front = bond(s, o.aim) - other_tip(s)
+  o.hook_front = r.bond(s, o.aim) - r.other_tip(s)
   o.hook_gap = gap(s, o)
   o.retracted = retraction(s, o) / AWAY
   o.burnt = min(o.time / BURN, 1.0)
@@ -225,7 +206,7 @@ def observe(s, o):
 class Bimanual(Dissect):
   """Retract with one hand, dissect with the other."""
 
-  rules = Rules(
+  rules = r.Rules(
     State,
     advance,
     observe,
@@ -260,7 +241,7 @@ class Bimanual(Dissect):
 
   def harsh(self, physics: Physics) -> bool:
     """Returns whether a force is over its limit, or the hook burns what it touches."""
-    pressed = other_force(physics) > HOOK_LIMIT
+    pressed = r.other_force(physics) > HOOK_LIMIT
     return super().harsh(physics) or pressed or self.time > _BURNING * BURN
 
   def label(self, kind: str) -> str:
@@ -316,7 +297,7 @@ class Bimanual(Dissect):
       while self.outcome is None and fair(physics, self) and aim == self.aim:
         p.extra[:] = 1.0 if gap(physics, self) < 0.0 else -1.0
         if distances(physics, self)[aim] > enough:
-          step = bond(physics, aim) + OFF * up - p.tip
+          step = r.bond(physics, aim) + OFF * up - p.tip
           most = 0.02 * p.style.speed * self.control_timestep
           p.tip = p.tip + step * min(1.0, most / max(float(np.linalg.norm(step)), 1e-9))
         yield p.step()

@@ -20,23 +20,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ...core import rules as r
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.rules import (
-  NOW,
-  Rules,
-  Vector,
-  bond,
-  bonds,
-  closeness,
-  drop,
-  is_free,
-  length,
-  many,
-  point,
-  tip,
-  vector,
-)
 from ...core.scenes import Scene
 from ...registry import exercise
 from ..grasp import FUNDUS, GRIPS, Held, Hold, distance, follow
@@ -78,8 +64,8 @@ def hard(**kwargs):
 class State(Held, Freed):
   """State of a world."""
 
-  front: Vector
-  last: Vector  # where the tip was a control step ago [m]
+  front: r.Vector
+  last: r.Vector  # where the tip was a control step ago [m]
 
 
 # The rules.
@@ -90,48 +76,48 @@ def middle(s):
   return held(s).mean(axis=0)
 
 
-@many(middle)
+@r.many(middle)
 def _middle(s):
-  found, total = holding(s), vector(0.0, 0.0, 0.0)
-  for k in range(bonds(s)):
-    if found == 0 or not is_free(s, k):
-      total += bond(s, k)
-  return total / float(bonds(s) if found == 0 else found)
+  found, total = holding(s), r.vector(0.0, 0.0, 0.0)
+  for k in range(r.bonds(s)):
+    if found == 0 or not r.is_free(s, k):
+      total += r.bond(s, k)
+  return total / float(r.bonds(s) if found == 0 else found)
 
 
 def hold(s, o):
   """Follows the grasp; returns too how close the tip is to it, 1 while it holds."""
   o, lost = follow(s, o)
   if lost:
-    drop(s, o)
-  return o, 1.0 if o.grasped == 1.0 else closeness(distance(s, o), o.distance0)
+    r.drop(s, o)
+  return o, 1.0 if o.grasped == 1.0 else r.closeness(distance(s, o), o.distance0)
 
 
 def advance(s, o):
   """Follows the grasp and what comes free."""
   o, near = hold(s, o)
-  slow = length(tip(s) - o.last) < RIP * o.control_timestep
-  o.last = tip(s)
+  slow = r.length(r.tip(s) - o.last) < RIP * o.control_timestep
+  o.last = r.tip(s)
   o, outcome = count(s, o, o.grasped == 1.0 and slow)
   return o, earned(o, near, outcome), outcome
 
 
 def observe(s, o):
   """Finds target and front; freed, traction and grasped are up to date."""
-  o.target = point(s, o.site) - tip(s)
-  o.front = middle(s) - tip(s)
+  o.target = r.point(s, o.site) - r.tip(s)
+  o.front = middle(s) - r.tip(s)
   return o
 
 
 def mark(s, o, k):
   """Marks the site."""
-  return point(s, o.site), NOW
+  return r.point(s, o.site), r.NOW
 
 
 class Dissect(Freeing, Hold):
   """Free an organ from its bed by traction."""
 
-  rules = Rules(
+  rules = r.Rules(
     State, advance, observe, ("target", "front", "freed", "traction", "grasped"), METRICS,
     COLUMNS | GRIPS, mark=mark,
   )  # fmt: skip

@@ -4,18 +4,8 @@ import math
 
 import numpy as np
 
+from ...core import rules as r
 from ...core.base import Physics, Task
-from ...core.rules import (
-  DAMAGED,
-  RUNNING,
-  SUCCESS,
-  bonds,
-  is_free,
-  peak,
-  share_freed,
-  tear,
-  traction,
-)
 from ...core.scenes import FILM, RAW, Scene, films
 
 SEEN = 1e-5  # what rounding may take from a share, in float32 too
@@ -48,29 +38,29 @@ def ruined(o):
 
 def count(s, o, fair):
   """Counts what came free, as torn where it was not fair; returns too what outcome that makes."""
-  o.traction = traction(s)
+  o.traction = r.traction(s)
   o.pulled = max(o.pulled, o.traction)
-  now = share_freed(s)
+  now = r.share_freed(s)
   more = now - o.freed
   o.freed = now
-  if fair and peak(s) <= o.force_limit and o.traction <= o.limit:
+  if fair and r.peak(s) <= o.force_limit and o.traction <= o.limit:
     o.clean = o.clean + more
   elif more > 0.0:
     o.torn = o.torn + more
-    tear(s, o, more)
-  outcome = RUNNING
+    r.tear(s, o, more)
+  outcome = r.RUNNING
   if o.clean >= o.wanted - SEEN:
-    outcome = SUCCESS
+    outcome = r.SUCCESS
   elif ruined(o):
-    outcome = DAMAGED
+    outcome = r.DAMAGED
   return o, outcome
 
 
 def earned(o, near, outcome):
   """Returns the progress, of closeness to where the work begins and of what is clean."""
-  if outcome == DAMAGED:
+  if outcome == r.DAMAGED:
     return -1.0
-  if outcome == SUCCESS:
+  if outcome == r.SUCCESS:
     return 1.0
   return 0.1 * near + 0.8 * min(o.clean / o.wanted, 1.0)
 
@@ -84,8 +74,8 @@ def held(s) -> np.ndarray:
 def holding(s):
   """Returns how many bonds hold."""
   found = int(0)
-  for k in range(bonds(s)):
-    if not is_free(s, k):
+  for k in range(r.bonds(s)):
+    if not r.is_free(s, k):
       found += 1
   return found
 
@@ -116,7 +106,7 @@ class Freeing(Task):
   def whole(self, physics: Physics) -> None:
     """Begins with bonds that are whole."""
     self.clean, self.torn, self.traction, self.pulled = 0.0, 0.0, 0.0, 0.0
-    self.freed = share_freed(physics)
+    self.freed = r.share_freed(physics)
     self._films = films(physics.model.ptr, physics.organ.bonds.vertices)[1]
 
   def show(self, physics: Physics) -> None:

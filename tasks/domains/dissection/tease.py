@@ -16,22 +16,9 @@ import itertools
 import mujoco
 import numpy as np
 
+from ...core import rules as r
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.rules import (
-  FAR,
-  NOW,
-  Rules,
-  Vector,
-  bond,
-  bonds,
-  closeness,
-  is_free,
-  length,
-  many,
-  tip,
-  vector,
-)
 from ...core.scenes import Scene
 from ...registry import exercise
 from . import adhesion
@@ -72,10 +59,10 @@ def hard(**kwargs):
 class State(Freed):
   """State of a world."""
 
-  front: Vector  # of what holds [m]
+  front: r.Vector  # of what holds [m]
   distance0: float  # [m]
   nearest: float  # best closeness so far
-  target: Vector
+  target: r.Vector
 
 
 # The rules.
@@ -88,48 +75,48 @@ def front(s):
   return np.array([0.0, row[:, 1].min(), row[:, 2].mean()])
 
 
-@many(front)
+@r.many(front)
 def _front(s):
-  every, low, high, found = holding(s) == 0, float(FAR), float(0.0), float(0.0)
-  for k in range(bonds(s)):
-    if every or not is_free(s, k):
-      low = min(low, bond(s, k)[1])
-  for k in range(bonds(s)):
-    if (every or not is_free(s, k)) and bond(s, k)[1] < low + ROW:
-      high += bond(s, k)[2]
+  every, low, high, found = holding(s) == 0, float(r.FAR), float(0.0), float(0.0)
+  for k in range(r.bonds(s)):
+    if every or not r.is_free(s, k):
+      low = min(low, r.bond(s, k)[1])
+  for k in range(r.bonds(s)):
+    if (every or not r.is_free(s, k)) and r.bond(s, k)[1] < low + ROW:
+      high += r.bond(s, k)[2]
       found += 1.0
-  return vector(0.0, low, high / found)
+  return r.vector(0.0, low, high / found)
 
 
 def distance(s, o):
   """Returns how far the tip is from the front [m]."""
-  return length(o.front - tip(s))
+  return r.length(o.front - r.tip(s))
 
 
 def advance(s, o):
   """Follows what comes free."""
   o, outcome = count(s, o, True)
   o.front = front(s)
-  o.nearest = max(o.nearest, closeness(distance(s, o), o.distance0))
+  o.nearest = max(o.nearest, r.closeness(distance(s, o), o.distance0))
   return o, earned(o, o.nearest, outcome), outcome
 
 
 def observe(s, o):
   """Finds target; freed and traction are up to date."""
-  o.target = o.front - tip(s)
+  o.target = o.front - r.tip(s)
   return o
 
 
 def mark(s, o, k):
   """Marks the front."""
-  return o.front, NOW
+  return o.front, r.NOW
 
 
 class Tease(Freeing):
   """Free a strip by blunt strokes."""
 
   watch = ("unintended_contact",)
-  rules = Rules(
+  rules = r.Rules(
     State, advance, observe, ("target", "freed", "traction"), METRICS, COLUMNS, mark=mark
   )
   slots = 24

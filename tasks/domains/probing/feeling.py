@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array, floats, ints
 
-from ...core.rules import FAR, Vector, dot, length, many, root
+from ...core import rules as r
 
 LEFT = 0.02  # force below which a press has ended [N]
 DEEP = 0.0028  # what tells enough [m]
@@ -35,7 +35,7 @@ class Notes:
   last: int  # place that was noted
   depth: float  # there, 0 where no press goes on [m]
   next: int  # place to feel next, -1 where enough is felt
-  likely: Vector  # where an inclusion is to be expected [m]
+  likely: r.Vector  # where an inclusion is to be expected [m]
   doubt: float  # RMS distance from there to where else it may be [m]
 
 
@@ -53,7 +53,7 @@ def start(o: Any, places: np.ndarray, outward: np.ndarray, beside: np.ndarray) -
   """
   o.places, o.outward, o.beside = places, outward, beside
   o.nplace, o.stiffness, o.depth = len(places), np.zeros(len(places)), 0.0
-  o.likely, o.doubt = places.mean(axis=0), FAR
+  o.likely, o.doubt = places.mean(axis=0), r.FAR
   o.last = o.next = nearest(o, o.likely)
 
 
@@ -71,7 +71,7 @@ def press(o, here, force):
     o.depth = 0.0
     return o
   k = nearest(o, here)
-  deep = dot(o.places[k] - here, o.outward[k])
+  deep = r.dot(o.places[k] - here, o.outward[k])
   if deep > max(o.depth, DEEP):
     if o.depth > 0.0:
       o.stiffness[o.last] = 0.0
@@ -112,11 +112,11 @@ def nearest(o, point):
   return int(np.linalg.norm(o.places - point, axis=1).argmin())
 
 
-@many(nearest)
+@r.many(nearest)
 def _nearest(o, point):
   k = int(0)
   for i in range(o.places.shape[0]):
-    if length(o.places[i] - point) < length(o.places[k] - point):
+    if r.length(o.places[i] - point) < r.length(o.places[k] - point):
       k = i
   return k
 
@@ -126,7 +126,7 @@ def stiffest(o):
   return int(o.stiffness.argmax())
 
 
-@many(stiffest)
+@r.many(stiffest)
 def _stiffest(o):
   top = int(0)
   for i in range(o.stiffness.shape[0]):
@@ -141,7 +141,7 @@ def soft(o):
   return float(np.quantile(felt, SOFT, method="lower")) if len(felt) else 0.0
 
 
-@many(soft)
+@r.many(soft)
 def _soft(o):
   count = int(0)
   for i in range(o.stiffness.shape[0]):
@@ -167,17 +167,17 @@ def new(o, place, apart):
   return k if away[k] < np.inf else -1
 
 
-@many(new)
+@r.many(new)
 def _new(o, place, apart):
   found = int(-1)
   least = float(0.0)
   for k in range(o.places.shape[0]):
-    away = length(o.places[k] - place)
+    away = r.length(o.places[k] - place)
     if found < 0 or away < least:
       left = wp.bool(True)
       for j in range(o.places.shape[0]):
         if left and o.stiffness[j] > 0.0:
-          left = length(o.places[k] - o.places[j]) >= apart
+          left = r.length(o.places[k] - o.places[j]) >= apart
       if left:
         found = k
         least = away
@@ -194,14 +194,14 @@ def side(o, top):
   return -1
 
 
-@many(side)
+@r.many(side)
 def _side(o, top):
   for i in range(4):
     k = o.beside[top, i]
     new = k >= 0
     for j in range(o.places.shape[0]):
       if new and o.stiffness[j] > 0.0 and j != top:
-        new = length(o.places[j] - o.places[k]) >= NEAR
+        new = r.length(o.places[j] - o.places[k]) >= NEAR
     if new:
       return k
   return -1
@@ -219,7 +219,7 @@ def expected(o, low):
   return middle, float(np.sqrt(likely @ ((o.places - middle) ** 2).sum(axis=1)))
 
 
-@many(expected)
+@r.many(expected)
 def _expected(o, low):
   best, mass, square = float(0.0), float(0.0), float(0.0)
   sum = wp.vec3()
@@ -230,9 +230,9 @@ def _expected(o, low):
     away = o.places[k] - o.places[o.last]  # small numbers: squares of them are told apart
     mass += likely
     sum += likely * away
-    square += likely * dot(away, away)
+    square += likely * r.dot(away, away)
   sum = sum / mass
-  return o.places[o.last] + sum, root(max(square / mass - dot(sum, sum), 0.0))
+  return o.places[o.last] + sum, r.root(max(square / mass - r.dot(sum, sum), 0.0))
 
 
 def _gain(o, k, low):
@@ -240,7 +240,7 @@ def _gain(o, k, low):
   both, square = float(0.0), float(LEAST)
   for j in range(o.places.shape[0]):
     if o.stiffness[j] > 0.0:
-      ratio = length(o.places[j] - o.places[k]) / (WIDTH * o.radius)
+      ratio = r.length(o.places[j] - o.places[k]) / (WIDTH * o.radius)
       bell = wp.exp(-ratio * ratio)
       both += bell * (o.stiffness[j] - low)
       square += bell * bell

@@ -12,26 +12,10 @@ import scipy
 from palpate.models import shapes
 from palpate.tissue.types import ints
 
+from ...core import rules as r
 from ...core import scenes
 from ...core.base import Physics, Task
 from ...core.performer import Performer, Script
-from ...core.rules import (
-  HIDDEN,
-  LATER,
-  MISSED,
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  ended,
-  force,
-  last_component,
-  length,
-  many,
-  miss,
-  reach,
-  tip,
-)
 from ...core.scenes import Scene
 from . import feeling
 from .feeling import APART, SHARED, SOFT, Notes, chance, nearest, press, sure
@@ -51,14 +35,14 @@ class State(Notes):
   """State of a world."""
 
   tolerance: float  # of the report [m]
-  center: Vector  # of the field [m]
-  inclusion: Vector  # where it is [m]
+  center: r.Vector  # of the field [m]
+  inclusion: r.Vector  # where it is [m]
   touched: Annotated[Any, ints("nplace")]  # 1 where the probe has felt near a place
-  field: Vector
+  field: r.Vector
   felt: float
   left: float
-  target: Vector
-  normal: Vector
+  target: r.Vector
+  normal: r.Vector
 
 
 # The rules.
@@ -71,11 +55,11 @@ def touch(o, here):
   return o
 
 
-@many(touch)
+@r.many(touch)
 def _touch(o, here):
   count = int(0)
   for k in range(o.places.shape[0]):
-    if length(o.places[k] - here) < FELT:
+    if r.length(o.places[k] - here) < FELT:
       o.touched[k] = 1
     count += o.touched[k]
   o.felt = float(count) / float(o.places.shape[0])
@@ -84,18 +68,18 @@ def _touch(o, here):
 
 def advance(s, o):
   """Follows what was felt, and judges the report."""
-  pressed, here = force(s), tip(s)
-  if last_component(s, o) > 0.5:
-    off = length(here - o.inclusion)
+  pressed, here = r.force(s), r.tip(s)
+  if r.last_component(s, o) > 0.5:
+    off = r.length(here - o.inclusion)
     if off <= o.tolerance and pressed >= REPORT and sure(o):
-      reach(s, o, off)
-      return o, 1.0, SUCCESS
-    miss(s, o, off)
-    return o, 0.0, MISSED
+      r.reach(s, o, off)
+      return o, 1.0, r.SUCCESS
+    r.miss(s, o, off)
+    return o, 0.0, r.MISSED
   o = press(o, here, pressed)
   if pressed >= FEELING:
     o = touch(o, here)
-  return o, 0.3 * o.felt, RUNNING
+  return o, 0.3 * o.felt, r.RUNNING
 
 
 def goal(o):
@@ -107,7 +91,7 @@ def goal(o):
 
 def observe(s, o):
   """Finds field, left, target and normal; felt is up to date."""
-  here = tip(s)
+  here = r.tip(s)
   o.left = 1.0 if o.next >= 0 else 0.0
   o.field = o.center - here
   o.target = goal(o) - here
@@ -117,13 +101,13 @@ def observe(s, o):
 
 def mark(s, o, k):
   """Marks the inclusion, once it was reported."""
-  return o.inclusion, LATER if ended(s, o) else HIDDEN
+  return o.inclusion, r.LATER if r.ended(s, o) else r.HIDDEN
 
 
 class Palpate(Task):
   """Find the stiff inclusion and report its place."""
 
-  rules = Rules(
+  rules = r.Rules(
     State, advance, observe, ("field", "felt", "left", "target", "normal"), shared=SHARED, mark=mark
   )
   final = ("report",)

@@ -30,25 +30,9 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array, ints
 
+from ...core import rules as r
 from ...core.base import Physics, Task
 from ...core.performer import Performer, Script
-from ...core.rules import (
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  clamp,
-  closeness,
-  dot,
-  force,
-  length,
-  miss,
-  normal,
-  reach,
-  root,
-  shown,
-  tip,
-)
 from ...core.scenes import Scene
 from ...registry import exercise
 from ..touch import SLACK, draw_apart
@@ -129,8 +113,8 @@ class State:
   time: float  # in the band [s]
   pressing: bool
   distance0: float  # [m]
-  target: Vector
-  normal: Vector
+  target: r.Vector
+  normal: r.Vector
   level: float  # from the middle of the band [N] or [m]
   held: float
 
@@ -145,42 +129,42 @@ def now(o):
 
 def distance(s, o):
   """Returns how far the tip is from the site along the surface, or above it [m]."""
-  offset = tip(s) - o.points[now(o)]
-  height = dot(offset, o.normals[now(o)])
-  aside = length(offset - height * o.normals[now(o)])
+  offset = r.tip(s) - o.points[now(o)]
+  height = r.dot(offset, o.normals[now(o)])
+  aside = r.length(offset - height * o.normals[now(o)])
   above = max(height, 0.0)
-  return root(aside * aside + above * above)
+  return r.root(aside * aside + above * above)
 
 
 def level(s, o):
   """Returns what the band is about: the force [N] or the depth below the resting surface [m]."""
   if o.by_depth:
-    return max(0.0, dot(o.points[now(o)] - tip(s), o.normals[now(o)]))
-  return force(s)
+    return max(0.0, r.dot(o.points[now(o)] - r.tip(s), o.normals[now(o)]))
+  return r.force(s)
 
 
 def towards(o, much):
   """Returns how near what is pressed is to the band: 1 in it, 0 without, less above it [-]."""
-  return clamp(much / o.low, 0.0, 1.0) - clamp((much - o.high) / o.high, 0.0, 1.0)
+  return r.clamp(much / o.low, 0.0, 1.0) - r.clamp((much - o.high) / o.high, 0.0, 1.0)
 
 
 def advance(s, o):
   """Counts the time in the band."""
-  far, pressed = distance(s, o), force(s)
+  far, pressed = distance(s, o), r.force(s)
   if pressed > PRESSES and not o.pressing and far > o.tolerance:
-    miss(s, o, far)
+    r.miss(s, o, far)
   o.pressing = pressed > (LEAVES if o.pressing else PRESSES)
   much = level(s, o)
   inside = far <= o.tolerance and o.low <= much and much <= o.high and pressed > 0.02
   o.time = o.time + o.control_timestep if inside else 0.0
   if o.time >= o.hold - SLACK:
-    reach(s, o, far)
+    r.reach(s, o, far)
     o.done = o.done + 1
     o.time = 0.0
     far = distance(s, o)
     o.distance0 = far
-  outcome = SUCCESS if o.done == o.goals.shape[0] else RUNNING
-  near = closeness(far, o.distance0)
+  outcome = r.SUCCESS if o.done == o.goals.shape[0] else r.RUNNING
+  near = r.closeness(far, o.distance0)
   firm = towards(o, much) if far <= o.tolerance else 0.0
   progress = float(o.done) + 0.4 * near + 0.05 * firm + 0.5 * o.time / o.hold
   return o, progress / float(o.goals.shape[0]), outcome
@@ -188,8 +172,8 @@ def advance(s, o):
 
 def observe(s, o):
   """Finds target, normal, level and held."""
-  o.target = o.points[now(o)] - tip(s)
-  o.normal = normal(s, o.goals[now(o)])
+  o.target = o.points[now(o)] - r.tip(s)
+  o.normal = r.normal(s, o.goals[now(o)])
   o.level = level(s, o) - 0.5 * (o.low + o.high)
   o.held = o.time / o.hold
   return o
@@ -197,13 +181,13 @@ def observe(s, o):
 
 def mark(s, o, k):
   """Marks the sites that are left."""
-  return o.points[k], shown(k, o.done)
+  return o.points[k], r.shown(k, o.done)
 
 
 class Press(Task):
   """Press sites into a band of force or depth and hold."""
 
-  rules = Rules(State, advance, observe, ("target", "normal", "level", "held"), mark=mark)
+  rules = r.Rules(State, advance, observe, ("target", "normal", "level", "held"), mark=mark)
 
   def __init__(
     self,

@@ -25,23 +25,9 @@ import palpate
 import warp as wp
 from palpate.tissue.types import Array, floats
 
+from ...core import rules as r
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.rules import (
-  DAMAGED,
-  MISSED,
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  clamp,
-  closeness,
-  length,
-  needle_place,
-  pierced,
-  pinhole,
-  vector,
-)
 from ...core.scenes import Scene
 from ...registry import exercise
 from .. import sheet
@@ -110,10 +96,10 @@ class State(Hands):
   pull: float  # of the needle on the wall [N]
   pulled: float  # the largest so far [N]
   deepest: float  # how far the needle was under the wall [m]
-  target: Vector
-  way: Vector
-  circle: Vector
-  middle: Vector
+  target: r.Vector
+  way: r.Vector
+  circle: r.Vector
+  middle: r.Vector
   pierced: float
   out: float
   holds: float
@@ -125,7 +111,7 @@ class State(Hands):
 def advance(s, o):
   """Follows the needle through the wall."""
   o = grasped(s, o, right_grasp(s), 0.0)
-  count, pull = pierced(s)
+  count, pull = r.pierced(s)
   o.pull = pull
   o.pulled = max(o.pulled, pull)
   o, worst = open_holes(s, o, min(count, 2))
@@ -133,26 +119,26 @@ def advance(s, o):
     o.deepest = max(o.deepest, -lowest(s))
   o.out = 0.0
   if o.holes == 2:
-    _, along = pinhole(s, 1)
-    o.out = clamp((2.0 * QUARTER * RADIUS - along) / WANTED, 0.0, 1.0)
+    _, along = r.pinhole(s, 1)
+    o.out = r.clamp((2.0 * QUARTER * RADIUS - along) / WANTED, 0.0, 1.0)
   if o.pull > o.damage:
-    return o, -1.0, DAMAGED
-  far = length(arc(s, 1.0) - o.marks[min(o.holes, 1)])
-  progress = 0.3 * closeness(far, o.start0)
+    return o, -1.0, r.DAMAGED
+  far = r.length(arc(s, 1.0) - o.marks[min(o.holes, 1)])
+  progress = 0.3 * r.closeness(far, o.start0)
   if o.holes == 1:
-    progress = 0.4 + 0.2 * closeness(far, BITE)
+    progress = 0.4 + 0.2 * r.closeness(far, BITE)
   if o.holes == 2:
     progress = 0.7 + 0.3 * o.out
   if worst > o.tolerance or o.loose > LOST:
-    return o, progress, MISSED
-  return o, progress, SUCCESS if o.out >= 1.0 else RUNNING
+    return o, progress, r.MISSED
+  return o, progress, r.SUCCESS if o.out >= 1.0 else r.RUNNING
 
 
 def observe(s, o):
   """Finds where the needle is."""
-  middle = needle_place(s, vector(0.0, 0.0, 0.0))
+  middle = r.needle_place(s, r.vector(0.0, 0.0, 0.0))
   o.target = o.marks[min(o.holes, 1)] - arc(s, 1.0)
-  o.circle = needle_place(s, vector(0.0, 0.0, 1.0)) - middle
+  o.circle = r.needle_place(s, r.vector(0.0, 0.0, 1.0)) - middle
   o.middle = middle - o.marks[0]
   o.pierced = float(o.holes)
   o.holds = o.right_holds
@@ -162,7 +148,7 @@ def observe(s, o):
 class Drive(Stitching):
   """Drive a needle through two marks."""
 
-  rules = Rules(
+  rules = r.Rules(
     State,
     advance,
     observe,

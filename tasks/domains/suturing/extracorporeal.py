@@ -26,9 +26,9 @@ import mujoco
 import numpy as np
 from palpate.models import trocar
 
+from ...core import rules as r
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.rules import RUNNING, SUCCESS, closeness
 from ...core.scenes import CONTACT, Scene
 from ...metrics import knots
 from ...registry import exercise
@@ -171,7 +171,7 @@ class Extracorporeal(drain.Sewn):
       if physics.tip_pos()[2] > drain.HIGH + _MARK:
         self.tie(physics)
       return self.seated / self.throws
-    return (self.seated + 0.9 * max(closeness(high, self.high0), 0.0)) / self.throws
+    return (self.seated + 0.9 * max(r.closeness(high, self.high0), 0.0)) / self.throws
 
   def judge(self, physics: Physics) -> float:
     """Lets the strands go and pulls the stitch apart: is the knot right, and does it hold?"""
@@ -181,13 +181,13 @@ class Extracorporeal(drain.Sewn):
     if not self.free:
       self.pull(physics, 0.0)
     _, outcome = drain.pull_test(physics, self)
-    if outcome == RUNNING:
+    if outcome == r.RUNNING:
       return 0.95
     assert physics.thread
     places = knots.closed(physics.thread.positions, np.array([-1.0, 0.0, 0.0]))
     self.knot = knots.name(places)
     right = knots.same(knots.throws(places) or (), self.turns)
-    if right and outcome == SUCCESS:
+    if right and outcome == r.SUCCESS:
       self.outcome = "success"
       return 1.0
     self.outcome = "missed"

@@ -40,27 +40,9 @@ from palpate.engine.model.flexes import matrix
 from palpate.models import wrist
 from palpate.tissue.types import Array, ints
 
+from ...core import rules as r
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.rules import (
-  DAMAGED,
-  FAR,
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  clamp,
-  hold,
-  in_hand,
-  jaws,
-  many,
-  reach,
-  strand,
-  strands,
-  tied,
-  tip,
-  vector,
-)
 from ...core.scenes import Scene
 from ...core.stage import STATE, Stage
 from ...registry import exercise
@@ -128,9 +110,9 @@ class State:
   tension: float
   hardest: float  # largest pull on the drain so far [N]
   tightest: float  # largest tension so far [N]
-  short_tail: Vector
-  long_tail: Vector
-  stitch: Vector
+  short_tail: r.Vector
+  long_tail: r.Vector
+  stitch: r.Vector
   tied: float
   right_holds: float
   left_holds: float
@@ -151,13 +133,13 @@ def around(s, hand):
   return node, float(off[node].max())
 
 
-@many(around)
+@r.many(around)
 def around_each(s, hand):
   """Returns the same."""
   node = int(0)
-  least = float(FAR)
-  for k in range(strands(s)):
-    local = in_hand(s, hand, strand(s, k))
+  least = float(r.FAR)
+  for k in range(r.strands(s)):
+    local = r.in_hand(s, hand, r.strand(s, k))
     off = max(abs(local[0]) / _ACROSS_IT, abs(local[1]) / _BESIDE_IT)
     off = max(off, abs(local[2] - _PADS) / _ALONG_IT)
     if off < least:
@@ -172,28 +154,28 @@ def follow_jaws(s, o, hand):
   The node stays theirs until they are open, without a force: the thread does not meet them till
   then, as it is in them. So it is while the knot is tested.
   """
-  opening, target = jaws(s, hand)
+  opening, target = r.jaws(s, hand)
   if opening > _SHUT:
     o.held[hand] = -1
     o.firm[hand] = 0
-    hold(s, hand, -1, o.anchors[hand], False)
+    r.hold(s, hand, -1, o.anchors[hand], False)
   elif target > 0.0 or o.free > 0.0:
     o.firm[hand] = 0
-    hold(s, hand, o.held[hand], o.anchors[hand], False)
+    r.hold(s, hand, o.held[hand], o.anchors[hand], False)
   elif o.firm[hand] == 0:
     node, off = around(s, hand)
     if off <= 1.0:
       o.held[hand] = node
       o.firm[hand] = 1
-      o.anchors[hand] = in_hand(s, hand, strand(s, node))
-      hold(s, hand, node, o.anchors[hand], True)
+      o.anchors[hand] = r.in_hand(s, hand, r.strand(s, node))
+      r.hold(s, hand, node, o.anchors[hand], True)
   return o
 
 
 def begin(s, o):
   """Lets the hands hold what their closed jaws are around."""
   for hand in range(2):
-    hold(s, hand, -1, o.anchors[hand], False)
+    r.hold(s, hand, -1, o.anchors[hand], False)
     o = follow_jaws(s, o, hand)
   return o
 
@@ -205,7 +187,7 @@ def follow(s, o):
   o = follow_stitch(s, o)
   o.looked = o.looked + 1
   if o.looked % _LOOKS == 0:
-    found = tied(s, o.turns)
+    found = r.tied(s, o.turns)
     if found >= 0:
       o.tied = float(found) if found <= o.seated + 1 else 0.0
   return o
@@ -224,18 +206,18 @@ def judge(s, o):
     o, outcome = pull_test(s, o)
     return o, 0.95, outcome
   if o.broken or not o.whole:
-    return o, -1.0, DAMAGED
+    return o, -1.0, r.DAMAGED
   o.stayed = o.stayed + o.control_timestep if is_down(o) else 0.0
-  closing = clamp((GAPE - o.gap) / (GAPE - CLOSED), 0.0, 1.0)
+  closing = r.clamp((GAPE - o.gap) / (GAPE - CLOSED), 0.0, 1.0)
   before = 2.0 * (o.tied - 1.0)
   progress = 0.45 * (before + 1.0 + closing) / float(o.throws) if o.tied > 0.0 else 0.0
   if o.stayed > STAYS - 1e-6:
-    reach(s, o, o.gap)
+    r.reach(s, o, o.gap)
     if o.throws == 1:
-      return o, progress, SUCCESS
+      return o, progress, r.SUCCESS
     o.seated = o.seated + 1
     o.stayed = 0.0
-  return o, progress, RUNNING
+  return o, progress, r.RUNNING
 
 
 def advance(s, o):
@@ -245,9 +227,9 @@ def advance(s, o):
 
 def see_tails(s, o):
   """Finds where the tails are, and the stitch."""
-  o.short_tail = strand(s, strands(s) - 1) - tip(s)
-  o.long_tail = strand(s, 0) - tip(s)
-  o.stitch = vector(0.0, 0.0, _HIGH) - tip(s)
+  o.short_tail = r.strand(s, r.strands(s) - 1) - r.tip(s)
+  o.long_tail = r.strand(s, 0) - r.tip(s)
+  o.stitch = r.vector(0.0, 0.0, _HIGH) - r.tip(s)
   return o
 
 
@@ -267,7 +249,7 @@ class Knot(drain.Sewn):
     held, firm: what each hand holds, see `State`
   """
 
-  rules: Any = Rules(
+  rules: Any = r.Rules(
     State,
     advance,
     observe,

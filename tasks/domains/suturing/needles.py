@@ -13,26 +13,9 @@ import numpy as np
 from palpate.engine.model.flexes import matrix
 from palpate.models import trocar, wrist
 
+from ...core import rules as r
 from ...core.base import Physics, Task
 from ...core.performer import Performer, Script
-from ...core.rules import (
-  FAR,
-  Vector,
-  drop,
-  in_hand,
-  length,
-  needle_place,
-  other_pinch,
-  other_tip,
-  pinch,
-  pinhole,
-  reach,
-  root,
-  shown,
-  sine,
-  tip,
-  vector,
-)
 
 RADIUS = 0.026 / math.pi  # of the needle's circle [m]
 QUARTER = 0.5 * math.pi
@@ -81,10 +64,10 @@ class Hands:
 class Taking(Hands):
   """State of hands that take it from each other."""
 
-  circle: Vector  # axis of the needle's circle
-  hand_target: Vector  # in the frame of the hand that is to take it: where it may be taken [m]
-  hand_circle: Vector  # axis of its circle
-  hand_along: Vector  # way along it
+  circle: r.Vector  # axis of the needle's circle
+  hand_target: r.Vector  # in the frame of the hand that is to take it: where it may be taken [m]
+  hand_circle: r.Vector  # axis of its circle
+  hand_along: r.Vector  # way along it
 
 
 # The rules.
@@ -93,14 +76,14 @@ class Taking(Hands):
 def arc(s, share):
   """Returns where a share of the needle from the swage on ends [m]."""
   angle = 2.0 * QUARTER * (share - 0.5)
-  return needle_place(s, vector(RADIUS * sine(angle + QUARTER), RADIUS * sine(angle), 0.0))
+  return r.needle_place(s, r.vector(RADIUS * r.sine(angle + QUARTER), RADIUS * r.sine(angle), 0.0))
 
 
 def away(s, place):
   """Returns how far a place is from the needle's nearest piece [m]."""
   least = float(1.0)
   for k in range(PIECES + 1):
-    least = min(least, length(arc(s, float(k) / float(PIECES)) - place))
+    least = min(least, r.length(arc(s, float(k) / float(PIECES)) - place))
   return least
 
 
@@ -115,28 +98,28 @@ def in_jaws(s, o, hand, share, step):
     step: a small share, by its sign the way along the needle
   """
   place = arc(s, share)
-  o.hand_target = in_hand(s, hand, place)
-  o.hand_circle = in_hand(s, hand, place + o.circle) - o.hand_target
-  along = in_hand(s, hand, arc(s, share + step)) - o.hand_target
-  o.hand_along = along / length(along)
+  o.hand_target = r.in_hand(s, hand, place)
+  o.hand_circle = r.in_hand(s, hand, place + o.circle) - o.hand_target
+  along = r.in_hand(s, hand, arc(s, share + step)) - o.hand_target
+  o.hand_along = along / r.length(along)
   return o
 
 
 def right_grasp(s):
   """Returns 1 where the first hand, the right one, holds the needle, otherwise 0."""
-  return 1.0 if pinch(s) > HELD and away(s, tip(s)) < NEAR else 0.0
+  return 1.0 if r.pinch(s) > HELD and away(s, r.tip(s)) < NEAR else 0.0
 
 
 def left_grasp(s):
   """Returns the same of the other hand."""
-  return 1.0 if other_pinch(s) > HELD and away(s, other_tip(s)) < NEAR else 0.0
+  return 1.0 if r.other_pinch(s) > HELD and away(s, r.other_tip(s)) < NEAR else 0.0
 
 
 def grasped(s, o, right, left):
   """Follows which hands hold the needle, and how long none does."""
   o.regrasps = o.regrasps + max(right - o.right_holds, 0.0) + max(left - o.left_holds, 0.0)
   if right + left == 0.0 and o.right_holds + o.left_holds > 0.0:
-    drop(s, o)
+    r.drop(s, o)
   o.right_holds = right
   o.left_holds = left
   o.loose = o.loose + o.control_timestep if right + left == 0.0 else 0.0
@@ -146,10 +129,10 @@ def grasped(s, o, right, left):
 def open_holes(s, o, count):
   """Compares holes that are new with their marks; returns how far one is off at most [m]."""
   for k in range(o.holes, count):
-    place, _ = pinhole(s, k)
+    place, _ = r.pinhole(s, k)
     off = place - o.marks[k]
-    o.misses[k] = root(off[0] * off[0] + off[1] * off[1])
-    reach(s, o, o.misses[k])
+    o.misses[k] = r.root(off[0] * off[0] + off[1] * off[1])
+    r.reach(s, o, o.misses[k])
   o.holes = count
   worst = float(0.0)
   for k in range(count):
@@ -159,12 +142,12 @@ def open_holes(s, o, count):
 
 def mark_hole(s, o, k):
   """Marks the holes that are left to make, the next one in yellow."""
-  return o.marks[k] + vector(0.0, 0.0, MARK), shown(k, o.holes)
+  return o.marks[k] + r.vector(0.0, 0.0, MARK), r.shown(k, o.holes)
 
 
 def lowest(s):
   """Returns the height of the needle's lowest piece over the wall [m]."""
-  least = float(FAR)
+  least = float(r.FAR)
   for k in range(PIECES + 1):
     least = min(least, float(arc(s, float(k) / float(PIECES))[2]))
   return least
@@ -266,7 +249,7 @@ class Stitching(Needlework):
 
 def needle(physics: Any) -> Pose:
   """Returns the needle's pose: the middle of its circle, z along the circle's axis."""
-  places = [needle_place(physics, place) for place in (np.zeros(3), *np.eye(3))]
+  places = [r.needle_place(physics, place) for place in (np.zeros(3), *np.eye(3))]
   return places[0], np.column_stack([place - places[0] for place in places[1:]])
 
 

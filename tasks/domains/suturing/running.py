@@ -41,28 +41,9 @@ import warp as wp
 from palpate.models import trocar, wrist
 from palpate.tissue.types import Array, floats, ints
 
+from ...core import rules as r
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.rules import (
-  DAMAGED,
-  FAR,
-  MISSED,
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  clamp,
-  closeness,
-  corner,
-  length,
-  needle_place,
-  pierced,
-  pinhole,
-  shown,
-  taut,
-  torn_at,
-  vector,
-)
 from ...core.scenes import Scene
 from ...core.stage import STATE, Stage
 from ...registry import exercise
@@ -171,9 +152,9 @@ class State(Taking):
   deepest: float  # how far the needle was under its first mark [m]
   tightest: float  # largest tension so far [N]
   torn: float  # how far a hole has torn at most [m]
-  target: Vector
-  way: Vector
-  middle: Vector
+  target: r.Vector
+  way: r.Vector
+  middle: r.Vector
   stitches: float
   pierced: float
   through: float
@@ -186,7 +167,7 @@ class State(Taking):
 
 def place(s, o, k):
   """Returns where a mark is now [m]."""
-  a, b, c = corner(s, o.seat[k], 0), corner(s, o.seat[k], 1), corner(s, o.seat[k], 2)
+  a, b, c = r.corner(s, o.seat[k], 0), r.corner(s, o.seat[k], 1), r.corner(s, o.seat[k], 2)
   return o.shares[k][0] * a + o.shares[k][1] * b + o.shares[k][2] * c
 
 
@@ -197,9 +178,9 @@ def now(o):
 
 def widest(s, o):
   """Returns how far the cut gapes at most [m]."""
-  most = float(-FAR)
+  most = float(-r.FAR)
   for k in range(o.lips.shape[0]):
-    a, b = corner(s, o.lips[k, 0], o.lips[k, 1]), corner(s, o.lips[k, 2], o.lips[k, 3])
+    a, b = r.corner(s, o.lips[k, 0], o.lips[k, 1]), r.corner(s, o.lips[k, 2], o.lips[k, 3])
     most = max(most, float(b[0] - a[0]))
   return most
 
@@ -207,56 +188,56 @@ def widest(s, o):
 def advance(s, o):
   """Follows needle and thread through the wall, and the gap."""
   o = grasped(s, o, right_grasp(s), left_grasp(s))
-  count, pull = pierced(s)
+  count, pull = r.pierced(s)
   o.pull = pull
-  o.tight = taut(s)
+  o.tight = r.taut(s)
   o.pulled = max(o.pulled, pull)
   o.tightest = max(o.tightest, o.tight)
   number = o.marks.shape[0]
   for k in range(count):
-    o.torn = max(o.torn, torn_at(s, k))
+    o.torn = max(o.torn, r.torn_at(s, k))
   o, worst = open_holes(s, o, min(count, number))
   if o.holes > 2 * o.done:
     o.deepest = max(o.deepest, float(place(s, o, now(o))[2]) - lowest(s))
   o.through = 0.0
   if o.holes == 2 * o.done + 2:
-    _, along = pinhole(s, o.holes - 1)
-    o.through = clamp(1.0 - along / (2.0 * QUARTER * RADIUS), 0.0, 1.0)
+    _, along = r.pinhole(s, o.holes - 1)
+    o.through = r.clamp(1.0 - along / (2.0 * QUARTER * RADIUS), 0.0, 1.0)
     if along < 0.0:
       o.done = o.done + 1
       o.through = 0.0
   o.gap = widest(s, o)
   if o.pull > o.damage:
-    return o, -1.0, DAMAGED
+    return o, -1.0, r.DAMAGED
   todo = number // 2 - o.placed
   part = float(o.done - o.placed)
   if o.done < number // 2:
     first = now(o)
-    far = length(arc(s, 1.0) - place(s, o, first + min(max(o.holes - first, 0), 1)))
+    far = r.length(arc(s, 1.0) - place(s, o, first + min(max(o.holes - first, 0), 1)))
     if o.holes <= 2 * o.done:
-      part = part + 0.3 * closeness(far, o.start0)
+      part = part + 0.3 * r.closeness(far, o.start0)
     elif o.holes == 2 * o.done + 1:
-      part = part + 0.4 + 0.2 * closeness(far, 2.0 * BITE)
+      part = part + 0.4 + 0.2 * r.closeness(far, 2.0 * BITE)
     else:
       part = part + 0.6 + 0.4 * o.through
-  closing = clamp((o.gap0 - o.gap) / (o.gap0 - o.close), 0.0, 1.0)
+  closing = r.clamp((o.gap0 - o.gap) / (o.gap0 - o.close), 0.0, 1.0)
   progress = 0.7 * part / float(todo) + 0.3 * closing * float(o.done) / float(number // 2)
   o.closed = o.closed + o.control_timestep if o.gap < o.close else 0.0
   if count < 2 * o.done or worst > o.tolerance or o.loose > LOST:
-    return o, progress, MISSED
+    return o, progress, r.MISSED
   if o.done == number // 2 and o.closed > HELD - 1e-5:
-    return o, progress, SUCCESS
-  return o, progress, RUNNING
+    return o, progress, r.SUCCESS
+  return o, progress, r.RUNNING
 
 
 def observe(s, o):
   """Finds where the needle is from the stitch whose turn it is."""
-  middle = needle_place(s, vector(0.0, 0.0, 0.0))
+  middle = r.needle_place(s, r.vector(0.0, 0.0, 0.0))
   first = now(o)
   start, end = place(s, o, first), place(s, o, first + 1)
   o.target = place(s, o, first + min(max(o.holes - first, 0), 1)) - arc(s, 1.0)
-  o.way = (end - start) / length(end - start)
-  o.circle = needle_place(s, vector(0.0, 0.0, 1.0)) - middle
+  o.way = (end - start) / r.length(end - start)
+  o.circle = r.needle_place(s, r.vector(0.0, 0.0, 1.0)) - middle
   o.middle = middle - start
   o.stitches = float(o.done)
   o.pierced = float(max(o.holes - 2 * o.done, 0))
@@ -266,13 +247,13 @@ def observe(s, o):
 
 def mark(s, o, k):
   """Marks the holes that are left, the next one in yellow."""
-  return place(s, o, k) + vector(0.0, 0.0, MARK), shown(k, o.holes)
+  return place(s, o, k) + r.vector(0.0, 0.0, MARK), r.shown(k, o.holes)
 
 
 class Running(Stitching):
   """Close a cut with a running suture."""
 
-  rules = Rules(
+  rules = r.Rules(
     State,
     advance,
     observe,

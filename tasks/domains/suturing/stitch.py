@@ -31,27 +31,9 @@ import warp as wp
 from palpate.models import wrist
 from palpate.tissue.types import Array, floats
 
+from ...core import rules as r
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.rules import (
-  MISSED,
-  RUNNING,
-  Rules,
-  Vector,
-  clamp,
-  closeness,
-  fasten,
-  hold,
-  length,
-  needle_place,
-  pierced,
-  pinhole,
-  put_away,
-  tip,
-  torn_at,
-  tugged,
-  vector,
-)
 from ...core.scenes import Scene
 from ...core.stage import Stage
 from ...registry import exercise
@@ -138,9 +120,9 @@ class State(knot.State, Hands):
   placed: bool  # whether the needle is through
   right_needle: float  # whether a hand holds the needle; right_holds tells of the thread too
   left_needle: float
-  target: Vector
-  circle: Vector
-  needle: Vector
+  target: r.Vector
+  circle: r.Vector
+  needle: r.Vector
   pierced: float
   attached: float  # whether the needle is on its thread
 
@@ -151,21 +133,21 @@ class State(knot.State, Hands):
 def begin(s, o):
   """Lets the hands hold no thread, and the needle be on it."""
   for hand in range(2):
-    hold(s, hand, -1, o.anchors[hand], False)
-  fasten(s, o, True)
+    r.hold(s, hand, -1, o.anchors[hand], False)
+  r.fasten(s, o, True)
   return o
 
 
 def look(s, o):
   """Follows needle and thread through the tube, and who holds what."""
   o = follow(s, o)
-  count, _pull = pierced(s)
+  count, _pull = r.pierced(s)
   for k in range(count):
-    o.torn = max(o.torn, torn_at(s, k))
+    o.torn = max(o.torn, r.torn_at(s, k))
   o, worst = open_holes(s, o, min(count, 2))
   o.worst = worst
   if o.whole and not o.placed:
-    _, along = pinhole(s, 1)
+    _, along = r.pinhole(s, 1)
     o.placed = along < 0.0
   if not o.placed:
     o.whole = True
@@ -177,13 +159,13 @@ def look(s, o):
     o = grasped(s, o, right, left)
     o.right_needle = right
     o.left_needle = left
-    if tugged(s, _BESIDE) > _OFF:
-      fasten(s, o, False)
+    if r.tugged(s, _BESIDE) > _OFF:
+      r.fasten(s, o, False)
       o.attached = 0.0
   else:
     o.loose = o.loose + o.control_timestep if right + left == 0.0 else 0.0
     if o.loose > _TAKEN:
-      put_away(s, vector(_RIGHT, 0.0, -_DOWN))
+      r.put_away(s, r.vector(_RIGHT, 0.0, -_DOWN))
   return o
 
 
@@ -192,18 +174,18 @@ def advance(s, o):
   o = look(s, o)
   o, progress, outcome = judge(s, o)
   dropped = o.attached > 0.0 and o.loose > LOST
-  if outcome == RUNNING and (dropped or o.worst > o.tolerance):
-    outcome = MISSED
-  if outcome != RUNNING or o.tied > 0.0:
+  if outcome == r.RUNNING and (dropped or o.worst > o.tolerance):
+    outcome = r.MISSED
+  if outcome != r.RUNNING or o.tied > 0.0:
     return o, progress, outcome
   if o.placed:
     return o, 0.3 if o.attached > 0.0 else 0.4, outcome
   if o.holes == 2:
-    _, along = pinhole(s, 1)
-    return o, 0.2 + 0.1 * clamp(1.0 - along / (2.0 * QUARTER * RADIUS), 0.0, 1.0), outcome
-  far = length(arc(s, 1.0) - o.marks[o.holes])
+    _, along = r.pinhole(s, 1)
+    return o, 0.2 + 0.1 * r.clamp(1.0 - along / (2.0 * QUARTER * RADIUS), 0.0, 1.0), outcome
+  far = r.length(arc(s, 1.0) - o.marks[o.holes])
   start = BITE if o.holes > 0 else o.start0
-  return o, 0.1 * (float(o.holes) + closeness(far, start)), outcome
+  return o, 0.1 * (float(o.holes) + r.closeness(far, start)), outcome
 
 
 def observe(s, o):
@@ -211,10 +193,10 @@ def observe(s, o):
   o = see_tails(s, o)
   o.right_holds = max(float(o.firm[0]), o.attached * o.right_needle)
   o.left_holds = max(float(o.firm[1]), o.attached * o.left_needle)
-  middle = needle_place(s, vector(0.0, 0.0, 0.0))
+  middle = r.needle_place(s, r.vector(0.0, 0.0, 0.0))
   o.target = o.marks[min(o.holes, 1)] - arc(s, 1.0)
-  o.circle = needle_place(s, vector(0.0, 0.0, 1.0)) - middle
-  o.needle = middle - tip(s)
+  o.circle = r.needle_place(s, r.vector(0.0, 0.0, 1.0)) - middle
+  o.needle = middle - r.tip(s)
   o.pierced = float(o.holes)
   return o
 
@@ -227,7 +209,7 @@ class Stitch(Knot, Stitching):
     attached: whether it is on its thread
   """
 
-  rules = Rules(
+  rules = r.Rules(
     State,
     advance,
     observe,

@@ -30,24 +30,9 @@ import warp as wp
 from palpate.models import trocar, wrist
 from palpate.tissue.types import Array
 
+from ...core import rules as r
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.rules import (
-  MISSED,
-  RUNNING,
-  SUCCESS,
-  Rules,
-  Vector,
-  closeness,
-  dot,
-  length,
-  needle_place,
-  other_tip,
-  scraped,
-  shown,
-  tip,
-  vector,
-)
 from ...core.scenes import Scene
 from ...registry import exercise
 from .needles import (
@@ -130,10 +115,10 @@ class State(Taking):
   through: float
   scraping: float  # how long rings were touched [s]
   worst: float  # largest force on them [N]
-  lead: Vector
-  trail: Vector
-  way: Vector
-  target: Vector
+  lead: r.Vector
+  trail: r.Vector
+  way: r.Vector
+  target: r.Vector
 
 
 # The rules.
@@ -161,10 +146,10 @@ def crossing(s, o):
   before = from_first(s, o, 0.0) - middle
   for k in range(PIECES):
     after = from_first(s, o, float(k + 1) / float(PIECES)) - middle
-    a, b = dot(before, way), dot(after, way)
+    a, b = r.dot(before, way), r.dot(after, way)
     if a * b <= 0.0 and a != b:
       part = a / (a - b)
-      if length(before + part * (after - before)) < o.size:
+      if r.length(before + part * (after - before)) < o.size:
         found = (float(k) + part) / float(PIECES)
     before = after
   return found
@@ -173,7 +158,7 @@ def crossing(s, o):
 def advance(s, o):
   """Follows the needle: who holds it, what it scrapes on, and how far it is through the ring."""
   o = grasped(s, o, right_grasp(s), left_grasp(s))
-  force = scraped(s)
+  force = r.scraped(s)
   if force > 0.0:
     o.scraping = o.scraping + o.control_timestep
     o.worst = max(o.worst, force)
@@ -194,16 +179,16 @@ def advance(s, o):
     o.through = 0.0
     o.passed = False
     o.entered = 0
-    o.error0 = length(from_first(s, o, 0.0) - o.middles[now(o)])
+    o.error0 = r.length(from_first(s, o, 0.0) - o.middles[now(o)])
     takes = 0.0
-  part = 0.25 * closeness(length(from_first(s, o, 0.0) - o.middles[now(o)]), o.error0)
+  part = 0.25 * r.closeness(r.length(from_first(s, o, 0.0) - o.middles[now(o)]), o.error0)
   if o.through > 0.0:
     part = 0.25 + 0.4 * o.through + 0.1 * takes + 0.1 * takes * (1.0 - gives)
   count = o.middles.shape[0]
   progress = (float(o.done) + part) / float(count)
   if o.done == count:
-    return o, 1.0, SUCCESS
-  return o, progress, MISSED if o.loose > LOST else RUNNING
+    return o, 1.0, r.SUCCESS
+  return o, progress, r.MISSED if o.loose > LOST else r.RUNNING
 
 
 def observe(s, o):
@@ -211,25 +196,25 @@ def observe(s, o):
   middle = o.middles[now(o)]
   o.lead = from_first(s, o, 0.0) - middle
   o.trail = from_first(s, o, 1.0) - middle
-  o.circle = needle_place(s, vector(0.0, 0.0, 1.0)) - needle_place(s, vector(0.0, 0.0, 0.0))
+  o.circle = r.needle_place(s, r.vector(0.0, 0.0, 1.0)) - r.needle_place(s, r.vector(0.0, 0.0, 0.0))
   o.way = -o.ways[now(o)] if back(o) else 1.0 * o.ways[now(o)]
   if back(o):
-    o.target = arc(s, TAKEN) - tip(s)
+    o.target = arc(s, TAKEN) - r.tip(s)
     return in_jaws(s, o, 0, TAKEN, 0.01)
-  o.target = arc(s, 1.0 - TAKEN) - other_tip(s)
+  o.target = arc(s, 1.0 - TAKEN) - r.other_tip(s)
   return in_jaws(s, o, 1, 1.0 - TAKEN, -0.01)
 
 
 def mark(s, o, k):
   """Marks the rings that are left, above them."""
-  return o.middles[k] + vector(0.0, 0.0, o.size + 0.005), shown(k, o.done)
+  return o.middles[k] + r.vector(0.0, 0.0, o.size + 0.005), r.shown(k, o.done)
 
 
 class Transfer(Needlework):
   """Pass a needle through rings, from hand to hand."""
 
   mark_radius = 0.0015
-  rules = Rules(
+  rules = r.Rules(
     State,
     advance,
     observe,
