@@ -1,13 +1,13 @@
 """What needles and their threads are, by their bodies in a model, and where they go through."""
 
-import itertools
 from typing import Any
 
 import mujoco
 import numpy as np
 from palpate.tissue import config as configuration
-from palpate.tissue.geometry.mesh import Mesh
+from palpate.tissue.geometry.mesh import Mesh, crossings
 
+from ..engine import penetration
 from ..engine.model import declare, flexes, mjstruct
 from .host import Host
 
@@ -110,40 +110,8 @@ def radius(host: Host) -> float:
   return float(host.m.flex_radius[host.organ.flexes[-1]])
 
 
-def crossings(line: np.ndarray, x: np.ndarray) -> list[tuple[float, int, float, float, bool]]:
-  """Returns where a line goes through triangles.
-
-  Args:
-    line: its points [m]                   (n, 3)
-    x: corners of the triangles [m]        (nelem, 3, 3)
-
-  Returns:
-    of each place the line's edge plus the share of it, the triangle, the shares of its last two
-    corners, and whether one who comes from the line's end goes against its normal
-  """
-  out = []
-  e, g = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
-  for k, (start, stop) in enumerate(itertools.pairwise(line)):
-    way, r = stop - start, start - x[:, 0]
-    p, q = np.cross(way, g), np.cross(r, e)
-    det = (e * p).sum(axis=1)
-    det = np.where(np.abs(det) > 0, det, np.nan)
-    v, w, t = (r * p).sum(axis=1) / det, (q @ way) / det, (g * q).sum(axis=1) / det
-    found = (v >= 0) & (w >= 0) & (v + w <= 1) & (t >= 0) & (t <= 1)
-    for i in np.flatnonzero(found).tolist():
-      out.append((k + float(t[i]), i, float(v[i]), float(w[i]), bool(det[i] < 0)))
-  return out
-
-
 def _goes_through(line: np.ndarray, mesh: Mesh) -> bool:
   """Returns whether a line through points [m], (n, 3), goes through a surface or is inside."""
-  x = mesh.rest[mesh.elem]
-  if crossings(line, x):
+  if crossings(line, mesh.rest[mesh.elem]):
     return True
-  if not mesh.closed:
-    return False
-  a, b, c = np.moveaxis(x - line[0], 1, 0)  # solid angle (van Oosterom and Strackee 1983)
-  la, lb, lc = (np.linalg.norm(each, axis=1) for each in (a, b, c))
-  dots = (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
-  angle = 2 * np.arctan2((a * np.cross(b, c)).sum(axis=1), la * lb * lc + dots).sum()
-  return abs(angle) > 2 * np.pi
+  return mesh.closed and bool(penetration.inside(line[:1], mesh.rest, mesh.elem).any())

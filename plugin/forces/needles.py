@@ -352,7 +352,7 @@ class Needles(Force):
     if not len(nodes):
       raise ValueError(f"{what} has no thread, expected one joined by `add_needle`")
     line = np.stack([host.body_frame(int(body))[1] for body in nodes])
-    found = sorted(declare_needles.crossings(line, x[host.organ.mesh.elem]))
+    found = sorted(topology.crossings(line, x[host.organ.mesh.elem]))
     # Through an edge or a corner it goes once.
     rows = [
       row for row, last in zip(found, [(-1.0,), *found], strict=False) if row[0] > last[0] + _SAME

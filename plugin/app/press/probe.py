@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 from palpate.organ import Organ
+from palpate.tissue.geometry.mesh import crossings
 
 from ..console import CommandError
 
@@ -157,24 +158,6 @@ def front(model, data, probe: Probe) -> np.ndarray:
   return max(ends, key=lambda end: float(end @ axis))
 
 
-def pierced(organ: Organ, start: np.ndarray, end: np.ndarray) -> bool:
-  """Returns whether the organ's surface crosses the way from start to end [m]  (3,).
-
-  Rays against triangles after Moeller and Trumbore 1997.
-  """
-  a, b, c = np.moveaxis(organ.xpos[organ.elem], 1, 0)
-  e1, e2, s, ray = b - a, c - a, start - a, end - start
-  p, q = np.cross(ray, e2), np.cross(s, e1)
-  with np.errstate(divide="ignore", invalid="ignore"):
-    scale = 1 / np.einsum("ij,ij->i", e1, p)
-    u, v, t = (
-      np.einsum("ij,ij->i", s, p) * scale,
-      q @ ray * scale,
-      np.einsum("ij,ij->i", e2, q) * scale,
-    )
-  return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 1)).any())
-
-
 class _Way:
   """Where the probe is told to be: approach, press, hold, release."""
 
@@ -251,7 +234,8 @@ def press(
     at, position = data.time, float(data.qpos[probe.qposadr])
     moved = float(np.linalg.norm(organ.displacement[node]))
     now = start + (position - first) * data.xaxis[probe.joint]
-    through = way.touch is not None and pierced(organ, start, now)
+    line = np.stack([start, now])
+    through = way.touch is not None and bool(crossings(line, organ.xpos[organ.elem]))
     before = time.perf_counter()
     mujoco.mj_step(model, data)
     spent = time.perf_counter() - before

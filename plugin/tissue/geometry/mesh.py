@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 
 import numpy as np
 from scipy import sparse
@@ -252,6 +253,33 @@ def volume(position: np.ndarray, elem: np.ndarray) -> float:
   """Returns the enclosed volume of a closed surface [m^3]; the winding gives the sign."""
   a, b, c = (position[elem[:, k]] for k in range(3))
   return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+def crossings(line: np.ndarray, x: np.ndarray) -> list[tuple[float, int, float, float, bool]]:
+  """Returns where a line goes through triangles.
+
+  Rays against triangles after Moeller and Trumbore 1997.
+
+  Args:
+    line: its points [m]                   (n, 3)
+    x: corners of the triangles [m]        (nelem, 3, 3)
+
+  Returns:
+    of each place the line's edge plus the share of it, the triangle, the shares of its last two
+    corners, and whether one who comes from the line's end goes against its normal
+  """
+  out = []
+  e, g = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
+  for k, (start, stop) in enumerate(itertools.pairwise(line)):
+    way, r = stop - start, start - x[:, 0]
+    p, q = np.cross(way, g), np.cross(r, e)
+    det = (e * p).sum(axis=1)
+    det = np.where(np.abs(det) > 0, det, np.nan)
+    v, w, t = (r * p).sum(axis=1) / det, (q @ way) / det, (g * q).sum(axis=1) / det
+    found = (v >= 0) & (w >= 0) & (v + w <= 1) & (t >= 0) & (t <= 1)
+    for i in np.flatnonzero(found).tolist():
+      out.append((k + float(t[i]), i, float(v[i]), float(w[i]), bool(det[i] < 0)))
+  return out
 
 
 def build(organ: str, rest: np.ndarray, elem: np.ndarray, spare: int = 0) -> Mesh:
