@@ -106,7 +106,7 @@ def add_nodes(
   for k in np.setdiff1d(np.arange(len(points)), pins):
     bodies[k] = f"{body.name}_{k}"
     node = author.add_node(body, bodies[k], points[k], mass, 2 / 3 * mass * _BOX**2)
-    _own(node, body.name)
+    author.claim(node, body.name)
     points[k] = 0.0
   return points, bodies
 
@@ -115,7 +115,7 @@ def _add_windowed(spec, body, surface: topology.Mesh, pins, mass: float, texts, 
   """Adds plugin, rigid flex and windows of an organ; returns the flex."""
   name = body.name
   plugin = _instance(spec, name, texts | {"mass": text(mass, 17), "pin": text(pins)})
-  _own(body, name)
+  author.claim(body, name)
   bodies = [name] * surface.nvert
   flex = author.make_flex(spec, name, surface.rest, bodies, surface.elem, **look)
   flex.edgedamping = 0.0
@@ -247,8 +247,3 @@ def check_names(spec, name: str, nodes: int):
   for what, names in (("flex", spec.flexes), ("plugin instance", spec.plugins)):
     if name in {each.name for each in names}:
       raise ValueError(f"organ {name!r}: the spec has a {what} {name!r} already")
-
-
-def _own(body, name: str):
-  """Makes a body one of the plugin's instance."""
-  body.plugin.name, body.plugin.plugin_name, body.plugin.active = name, engine.NAME, True

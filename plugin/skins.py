@@ -6,7 +6,7 @@ from palpate.engine.model.skin import HIDDEN
 
 from .tissue.geometry import subdivide
 from .tissue.geometry.mesh import vertex_normals
-from .windows import find_organ
+from .windows import find_organ, own_bodies, rest_of
 
 _ENOUGH = 3500  # vertices of a skin, unless told how many
 
@@ -47,8 +47,9 @@ def add_skin(
     raise ValueError(f"organ {organ!r} has skin {have!r} already, expected none")
   smooth = _smooth(organ, np.reshape(flex.elem, (-1, 3)), levels)
   count = smooth.count
-  rest, parent = _rest(flex, bodies)
-  rest = rest[: np.max(flex.elem) + 1]  # without vertices that wait for cuts
+  rest = rest_of(flex, bodies)[: np.max(flex.elem) + 1]  # without vertices that wait for cuts
+  own = own_bodies(flex, bodies)  # none where it is rigid, and has windows
+  parent = own[0].parent.name if own else next(iter(flex.vertbody))
   points = smooth(rest)
   above = np.broadcast_to(np.asarray(height, float), (count,))
   points = points + above[:, None] * vertex_normals(points, smooth.elem)
@@ -79,18 +80,6 @@ def _smooth(organ: str, elem: np.ndarray, levels: int | None) -> subdivide.Smoot
   if levels not in subdivide.LEVELS:
     raise ValueError(f"organ {organ!r}: levels is {levels!r}, expected one of 1, 2, 3, 4")
   return subdivide.smooth(elem, levels)
-
-
-def _rest(flex, bodies: dict) -> tuple[np.ndarray, str]:
-  """Returns an organ's vertices in the body that it is in [m]  (n, 3), and that body's name."""
-  names = list(flex.vertbody)
-  on_bodies = not len(flex.vert)
-  rest = np.zeros((len(names), 3)) if on_bodies else np.reshape(flex.vert, (-1, 3)).copy()
-  own = [k for k, name in enumerate(names) if bodies[name].first_joint() is not None]
-  if not own:  # it is rigid, and has windows
-    return rest, names[0]
-  rest[own] += [bodies[names[k]].pos for k in own]
-  return rest, bodies[names[own[0]]].parent.name
 
 
 def _fine(organ: str, texcoord, smooth, coarse: int, count: int) -> np.ndarray:

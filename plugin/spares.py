@@ -6,10 +6,9 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
-from .engine import plugin as engine
 from .engine.cutting.walls import room
 from .tissue.geometry import mesh as topology
-from .windows import add_node, find_organ, make_flex, rest_of
+from .windows import add_node, claim, find_organ, make_flex, own_bodies, rest_of
 
 _INSIDE = (0.5, 0.13, 0.12, 1.0)  # colour of the walls of cuts in a solid
 _LIPS = (0.36, 0.05, 0.045, 1.0)  # of cuts in a sheet
@@ -38,16 +37,13 @@ def add_spare(spec: mujoco.MjSpec, organ: str, spare: int):
   vertbody = list(flex.vertbody)
   if len(vertbody) == 1:  # MuJoCo's short form of a rigid flex
     flex.vertbody = vertbody = vertbody * (len(flex.vert) // 3)
-  free = np.array([bodies[name].first_joint() is not None for name in vertbody])
-  own = [bodies[name] for name, moves in zip(vertbody, free, strict=True) if moves]
-  rest = rest_of(flex, free, own)
+  own, rest = own_bodies(flex, bodies), rest_of(flex, bodies)
   points = np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else np.zeros_like(rest)
   middle = rest.mean(axis=0)
   for k in range(spare):
     if own:
       made = add_node(own[0].parent, f"{organ}_spare_{k}", middle, own[0].mass, own[0].inertia[0])
-      made.plugin.name, made.plugin.plugin_name = plugin.name, engine.NAME
-      made.plugin.active = True
+      claim(made, plugin.name)
     vertbody.append(f"{organ}_spare_{k}" if own else vertbody[0])
   more = np.zeros((spare, 3)) + (0.0 if own else middle)
   flex.vert, flex.vertbody = np.concatenate([points, more]).ravel(), vertbody

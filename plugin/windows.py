@@ -58,7 +58,9 @@ def add_windows(
   nodal = len(set(flex.vertbody)) > 1 or "mass" not in config
   meets = (flex.contype, flex.conaffinity) if nodal or flex.contype or flex.conaffinity else (1, 1)
   colliding = [g for g in spec.geoms if (g.contype & meets[1]) | (g.conaffinity & meets[0])]
-  own = _own_bodies(flex, bodies) if nodal else []
+  own = own_bodies(flex, bodies) if nodal else []
+  if nodal and (not own or len({body.name for body in own}) < len(own)):
+    raise ValueError(f"organ {organ!r} has no vertices of its own, expected a <flexcomp>")
   pinned = nodal and len(own) < len(flex.vertbody)
   held = pinned or any(
     config.get(key, "").strip("0. ") for key in holders(config.get("carrier", ""))
@@ -66,7 +68,7 @@ def add_windows(
   followed = _followed(organ, groups, colliding, held)
   # From here on the spec changes.
   keys = _take_keys(spec)
-  surface = _make_rigid(spec, flex, own, plugin, config) if nodal else bodies[flex.vertbody[0]]
+  surface = _make_rigid(spec, flex, bodies, plugin, config) if nodal else bodies[flex.vertbody[0]]
   _add_window(spec, flex, surface, name, followed, nodes, meets, config)
   _warn_of_others(organ, colliding, groups, held, config.get("support", "").split())
   config["window"] = name
@@ -183,28 +185,31 @@ def _groups(organ: str, bodies: dict, tools) -> list[set[str]]:
   return groups
 
 
-def _own_bodies(flex, bodies: dict) -> list:
+def own_bodies(flex, bodies: dict) -> list:
   """Returns the bodies of a nodal organ's moving vertices."""
-  own = [bodies[name] for name in flex.vertbody if bodies[name].first_joint() is not None]
-  if not own or len({body.name for body in own}) < len(own):
-    raise ValueError(f"organ {flex.name!r} has no vertices of its own, expected a <flexcomp>")
-  return own
+  return [bodies[name] for name in flex.vertbody if bodies[name].first_joint() is not None]
 
 
-def rest_of(flex, free: np.ndarray, own: list) -> np.ndarray:
+def rest_of(flex, bodies: dict) -> np.ndarray:
   """Returns where vertices are in the body that an organ is in [m], (nvert, 3)."""
-  rest = np.zeros((len(free), 3))
-  rest += np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else 0.0  # none: all on their bodies
-  rest[free] += np.reshape([body.pos for body in own], (-1, 3))
+  names = list(flex.vertbody)
+  rest = np.array(flex.vert).reshape(-1, 3) if len(flex.vert) else np.zeros((len(names), 3))
+  own = [k for k, name in enumerate(names) if bodies[name].first_joint() is not None]
+  rest[own] += np.reshape([bodies[names[k]].pos for k in own], (-1, 3))
   return rest
 
 
-def _make_rigid(spec, flex, own: list, plugin, config: dict[str, str]):
+def claim(body, name: str):
+  """Makes a body one of a plugin instance's."""
+  body.plugin.name, body.plugin.plugin_name, body.plugin.active = name, engine.NAME, True
+
+
+def _make_rigid(spec, flex, bodies: dict, plugin, config: dict[str, str]):
   """Makes a nodal organ's flex rigid; returns the body it is in."""
-  vertbody = list(flex.vertbody)
+  vertbody, own = list(flex.vertbody), own_bodies(flex, bodies)
   free = np.isin(vertbody, [body.name for body in own])
   parent = own[0].parent
-  rest = rest_of(flex, free, own)
+  rest = rest_of(flex, bodies)
   nvert = len(rest) - int(config.get("spare", 0))
   config["mass"] = f"{nvert * np.mean([body.mass for body in own]):.9g}"
   if not free.all():
@@ -214,8 +219,7 @@ def _make_rigid(spec, flex, own: list, plugin, config: dict[str, str]):
     surface = parent.add_body(name=f"{flex.name}_surface")
     if own[0].frame is not None:
       surface.set_frame(own[0].frame)
-    surface.plugin.name, surface.plugin.plugin_name = plugin.name, engine.NAME
-    surface.plugin.active = True
+    claim(surface, plugin.name)
   flex.vert, flex.vertbody = rest.ravel(), [surface.name] * len(rest)  # MuJoCo 4 deletes it too
   flex.edgedamping = 0.0
   # One by one the vertices' bodies take MuJoCo quadratic time to delete.
