@@ -65,8 +65,8 @@ class Batch(abc.ABC):
     sizes |= {"sensordata": model.nsensordata}
     self._arrays = {name: self._make(size) for name, size in sizes.items()}
     self._arrays["time"] = wp.zeros(nworld, dtype=float, device=self.device)
-    self._summary = {
-      "peak": self._make(model.nsensor), "mean": self._make(model.nsensordata)
+    self._sums = {
+      "sensor_peak": self._make(model.nsensor), "sensor_mean": self._make(model.nsensordata)
     }  # fmt: skip
     self._counts = {
       name: wp.zeros(nworld, dtype=int, device=self.device) for name in ("failures", "overflow")
@@ -112,12 +112,12 @@ class Batch(abc.ABC):
   @property
   def sensor_peak(self) -> wp.array:
     """Largest norm of each sensor in the steps of the last call of `step`, (nworld, nsensor)."""
-    return self._summary["peak"]
+    return self._summed("sensor_peak")
 
   @property
   def sensor_mean(self) -> wp.array:
     """Mean of the sensors over the steps of the last call of `step`, (nworld, nsensordata)."""
-    return self._summary["mean"]
+    return self._summed("sensor_mean")
 
   def watch(self, steps: int) -> wp.array:
     """Returns where the sensors of each step will be, in calls of `step` of so many steps at most.
@@ -148,12 +148,16 @@ class Batch(abc.ABC):
   @property
   def failures(self) -> wp.array:
     """How often each world had numbers that are not finite, and was reset for it, (nworld,)."""
-    return self._counts["failures"]
+    return self._summed("failures")
 
   @property
   def overflow(self) -> wp.array:
     """Most touched triangles, or nodes, that windows had no room for so far, (nworld,)."""
-    return self._counts["overflow"]
+    return self._summed("overflow")
+
+  def _summed(self, name: str) -> wp.array:
+    """Returns a sum or a count."""
+    return (self._sums | self._counts)[name]
 
   def _state(self, name: str) -> wp.array:
     if not self._fresh:

@@ -69,25 +69,8 @@ class Several(Batch):
         wp.copy(_rows(out, part), array.contiguous())
     return out
 
-  @property
-  def failures(self) -> wp.array:
-    """How often each world had numbers that are not finite, and was reset for it, (nworld,)."""
-    return self.gather([part.failures for part in self.parts], self._counts["failures"])
-
-  @property
-  def overflow(self) -> wp.array:
-    """Most touched triangles, or nodes, that windows had no room for so far, (nworld,)."""
-    return self.gather([part.overflow for part in self.parts], self._counts["overflow"])
-
-  @property
-  def sensor_peak(self) -> wp.array:
-    """Largest norm of each sensor in the steps of the last call of `step`, (nworld, nsensor)."""
-    return self.gather([part.sensor_peak for part in self.parts], self._summary["peak"])
-
-  @property
-  def sensor_mean(self) -> wp.array:
-    """Mean of the sensors over the steps of the last call of `step`, (nworld, nsensordata)."""
-    return self.gather([part.sensor_mean for part in self.parts], self._summary["mean"])
+  def _summed(self, name: str) -> wp.array:
+    return self.gather([getattr(part, name) for part in self.parts], super()._summed(name))
 
   def _tell(self):
     for name in ("time", "qpos", "qvel", "sensordata"):

@@ -107,7 +107,7 @@ class Worlds(Batch):
       self._sensed: Any = kernels.Sensed()
       self._sensed.adr = wp.array([*model.sensor_adr, model.nsensordata], dtype=int)
       self._sensed.data, self._sensed.count = self.d.sensordata, wp.zeros(nworld, dtype=int)
-      self._sensed.peak, self._sensed.mean = self._summary["peak"], self._summary["mean"]
+      self._sensed.peak, self._sensed.mean = self._sums["sensor_peak"], self._sums["sensor_mean"]
       self._sensed.seen = self._make(0, model.nsensordata)
       self._felt: list[tuple[Organ, int]] = []
       self._callbacks()
@@ -317,7 +317,7 @@ class Worlds(Batch):
   # Doing.
 
   def _step(self, n: int):
-    for sums in self._summary.values():
+    for sums in self._sums.values():
       sums.zero_()
     for k in range(n):
       self._run("step")
