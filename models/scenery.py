@@ -104,23 +104,21 @@ def organ(name: str, levels: int = 1) -> Surface:
   return Surface(smooth(vertices), smooth.elem, texture.fold(points))
 
 
-def tube(points, radii, sides: int = 12, along: int = 30) -> Surface:
+def tube(points, radii) -> Surface:
   """Returns a tube with open ends along a smooth curve.
 
   Args:
     points: of the curve [m]                  (k, 3)
     radii: at these points [m]                (k,)
-    sides: vertices around it
-    along: rings of vertices
   """
   points, radii = np.asarray(points, float), np.asarray(radii, float)
   knots = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-  t = np.linspace(0, knots[-1], along)
+  t = np.linspace(0, knots[-1], 30)
   curve = scipy.interpolate.CubicSpline(knots, points)
   tangent = curve(t, 1) / np.linalg.norm(curve(t, 1), axis=1, keepdims=True)
   side = np.cross(tangent, [0.3, 0.5, 0.8])
   side /= np.linalg.norm(side, axis=1, keepdims=True)
-  angle = np.linspace(0, 2 * np.pi, sides + 1)
+  angle = np.linspace(0, 2 * np.pi, 13)
   ring = np.cos(angle)[None, :, None] * side[:, None]
   ring = ring + np.sin(angle)[None, :, None] * np.cross(side, tangent)[:, None]
   radius = np.interp(t, knots, radii)

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from palpate.tissue.reading import choices
@@ -86,7 +86,7 @@ def check_header(data: Any, name: str, version: int = 1) -> None:
     raise ValueError(f"{name}: version is {data.get('version')!r}, expected {version}")
 
 
-def check_names(names: Mapping[str, Any]) -> None:
+def check_names(names: Iterable[str]) -> None:
   """Raises ValueError unless all are names of metrics."""
   if strange := sorted(set(names) - set(METRICS)):
     raise ValueError(f"no such metric {strange[0]!r}, {choices(strange[0], METRICS)}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..metrics import METRICS, SUCCESS, Metrics, number
+from ..metrics import METRICS, SUCCESS, Metrics, check_names, number
 from . import cusum
 from .plots import blank, legend_above, tidy
 from .score import FLOOR, tells
@@ -40,14 +40,6 @@ class Attempt:
   proficient: bool
   assessment: bool
   metrics: Metrics
-
-
-def check_names(names: Sequence[str]) -> Sequence[str]:
-  """Returns the names; ValueError unless each is a metric."""
-  for name in names:
-    if name not in METRICS:
-      raise ValueError(f"metric is {name!r}, expected one of {', '.join(METRICS)}")
-  return names
 
 
 def learning_figure(

@@ -54,46 +54,40 @@ def weight(passed: bool) -> float:
   return math.log(ACCEPTABLE / UNACCEPTABLE)
 
 
-def chart(attempts: Iterable[bool], limit: float = LIMIT) -> list[Point]:
-  """Returns the chart after each attempt.
-
-  Args:
-    attempts: whether each was proficient, in order
-    limit: h, above 0 [-]
-  """
+def chart(attempts: Iterable[bool]) -> list[Point]:
+  """Returns the chart after each attempt, told whether each was proficient, in order."""
   points, value, competent = [], 0.0, False
   for passed in attempts:
-    value, crossed = _step(value, passed, competent, limit)
+    value, crossed = _step(value, passed, competent)
     competent ^= crossed
     points.append(Point(value, competent, crossed))
     value = 0.0 if crossed else value
   return points
 
 
-def _step(value: float, passed: bool, competent: bool, limit: float) -> tuple[float, bool]:
+def _step(value: float, passed: bool, competent: bool) -> tuple[float, bool]:
   """Returns the sum after an attempt, and whether it crossed the limit."""
   if competent:
     value = min(0.0, value + weight(passed))
-    return value, value <= -limit + _ROUNDING
+    return value, value <= -LIMIT + _ROUNDING
   value = max(0.0, value + weight(passed))
-  return value, value >= limit - _ROUNDING
+  return value, value >= LIMIT - _ROUNDING
 
 
-def chance(failing: float, attempts: int, competent: bool = False, limit: float = LIMIT) -> float:
+def chance(failing: float, attempts: int, competent: bool = False) -> float:
   """Returns how likely the limit is crossed within a number of attempts [-], exactly.
 
   Args:
     failing: true failure rate, in [0, 1] [-]
     attempts: how many there are
     competent: whether the learner is monitored; else learns
-    limit: h [-]
   """
   at, crossed = {0.0: 1.0}, 0.0  # sum -> how likely it is there, not having crossed
   for _ in range(attempts):
     then: dict[float, float] = {}
     for value, share in at.items():
       for passed, part in ((True, 1 - failing), (False, failing)):
-        new, over = _step(value, passed, competent, limit)
+        new, over = _step(value, passed, competent)
         if over:
           crossed += share * part
         else:

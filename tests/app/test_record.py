@@ -363,7 +363,7 @@ def test_what_the_coach_said_and_errors(folder):
     ("exercise touch/easy --references none.json", "references: none.json: No such file"),
     ("evaluate touch/easy --references .", "references: .: not palpate-references: not a file"),
     ("serve --trainee Bo", "no trainee 'Bo'"),
-    ("trainee show Ada --metric speed", "metric is 'speed', expected one of"),
+    ("trainee show Ada --metric speed", "no such metric 'speed'"),
     ("trainee show Ada --task touch/hard", "task is 'touch/hard', 'Ada' has done touch/easy"),
     ("trainee show Ada -o a.pdf", "out is 'a.pdf', expected a name that ends in .html or .png"),
     ("trainee limits -o a.json", "no FILE and no --trainee"),

@@ -20,6 +20,7 @@ FILMS = (".mp4", ".gif")
 PICTURES = (".png", ".webp", ".jpg")
 _FPS = 25  # of the laparoscope
 _SMALL = (320, 240)  # each picture of a strip [pixels]
+_COUNT = 5  # of these
 _MOST_PIXELS = 8192
 
 
@@ -106,14 +107,13 @@ class Strip:
   """Pictures of an exercise, evenly over its time, for a report: call it after every step.
 
   Args:
-    count: how many
     end: when the exercise ends, None where nobody knows [s]
   """
 
-  def __init__(self, count: int = 5, end: float | None = None):
-    self._look, self._count = Look(_SMALL), count
+  def __init__(self, end: float | None = None):
+    self._look = Look(_SMALL)
     self._frames: list[np.ndarray] = []
-    self._every, self._due = 0.5 if end is None else end / (count - 1), 0.0  # [s]
+    self._every, self._due = 0.5 if end is None else end / (_COUNT - 1), 0.0  # [s]
 
   def __call__(self, env: Any) -> None:
     """Takes the laparoscope's picture if it is due."""
@@ -121,7 +121,7 @@ class Strip:
     if time < self._due - 1e-9:
       return
     self._frames.append(self._look(env))
-    if len(self._frames) == 4 * self._count:  # the exercise is a long one
+    if len(self._frames) == 4 * _COUNT:  # the exercise is a long one
       self._frames, self._every = self._frames[::2], 2 * self._every
     self._due += self._every
 
@@ -130,7 +130,7 @@ class Strip:
     if not self._frames:
       return None
     last = len(self._frames) - 1
-    chosen = np.unique(np.linspace(0, last, self._count).round().astype(int))
+    chosen = np.unique(np.linspace(0, last, _COUNT).round().astype(int))
     return np.stack([self._frames[k] for k in chosen])
 
 

@@ -32,14 +32,16 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
+  from palpate.tasks.metrics import check_names
   from palpate.tasks.people import curves
 
   from .record import Record
 
+  metrics = args.metric or curves.SHOWN
   path = output("out", args.out, (".html", ".png")) if args.out else None
   known = keeping.references(args.references)
   with keeping.one_line():
-    metrics = curves.check_names(args.metric or curves.SHOWN)
+    check_names(metrics)
     record = Record(keeping.folder(args))
     person = record.find(args.name)
     episodes = record.episodes(person)
