@@ -1,10 +1,10 @@
 // The score card: done or not, what was good, what to do next; everything else behind a fold.
 import {t} from "./texts.js";
 
-function make(tag, text, kind) {
+export function make(tag, text = "", kind = "") {
   const element = document.createElement(tag);
   element.textContent = text;
-  if (kind) element.className = kind;
+  element.className = kind;
   return element;
 }
 const shown = text => text.replace(/\bcount$/, "").trim();
@@ -28,9 +28,9 @@ function orders({done, proficient, moved, better, helps}) {
 }
 
 function details({rows, composite}, where) {
-  const fold = make("details"), table = document.createElement("table");
+  const fold = make("details"), table = make("table");
   const line = (tag, cells, kind) => {
-    const row = document.createElement("tr");
+    const row = make("tr");
     row.append(...cells.map(cell => make(tag, cell, kind)));
     table.append(row);
   };

@@ -1,14 +1,8 @@
 // The home page: a card for each exercise, by domain, the easiest first.
+import {make} from "./card.js";
 import {domain, level, t, title} from "./texts.js";
 
 const KEY = "palpate.done";
-
-function make(tag, kind, text = "") {
-  const element = document.createElement(tag);
-  element.className = kind;
-  element.textContent = text;
-  return element;
-}
 
 export function picture(task) {
   const image = new Image();
@@ -55,20 +49,20 @@ export function groups({tasks}) {
 export function show(place, menu, start) {
   const {states, next} = standing(menu);
   place.replaceChildren(...groups(menu).map(([name, tasks]) => {
-    const row = make("div", "cards"), section = make("section", "domain");
+    const row = make("div", "", "cards"), section = make("section", "", "domain");
     row.append(...tasks.map(task => {
-      const card = make("button", `card ${states[task]}${task === next ? " next" : ""}`), shown = picture(task);
+      const card = make("button", "", `card ${states[task]}${task === next ? " next" : ""}`), shown = picture(task);
       const after = menu.locked[task], mark = {proficient: "★ ", done: "✓ ", locked: "🔒 ", open: ""}[states[task]];
       const tried = menu.progress?.[task]?.tried ? t("{0} of {1} attempts proficient", menu.progress[task].good, menu.progress[task].tried) : "";
       const status = after ? t("after {0}", title(after)) : task === next ? `${mark}${t("next")}` : mark + t(states[task]);
       shown.loading = "lazy";
       card.dataset.task = task;
       card.disabled = Boolean(after);
-      card.append(shown, make("strong", "", level(task)), make("span", "status", status), make("span", "what", t(menu.tasks[task])), make("span", "tried", tried));
+      card.append(shown, make("strong", level(task)), make("span", status, "status"), make("span", t(menu.tasks[task]), "what"), make("span", tried, "tried"));
       card.onclick = () => start(task);
       return card;
     }));
-    section.append(make("h2", "", name), row);
+    section.append(make("h2", name), row);
     return section;
   }));
 }
