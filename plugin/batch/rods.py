@@ -197,7 +197,7 @@ class Thread(thread.Thread):
     return self._broken
 
   def lay(self, places: np.ndarray, mask=None):
-    """Puts the nodes of worlds at places, at rest, see `thread.Thread`."""
+    """Puts the nodes of worlds at places, at rest; twist, breaks and kept bends are lost."""
     f, organ, batch = self.fields, self.declared, self._batch
     local = (np.asarray(places, float) - organ.origin) @ organ.frame
     laid: Any = kernels.Laid()
@@ -207,6 +207,10 @@ class Thread(thread.Thread):
       setattr(laid, name, getattr(f, name))
     batch._fresh = False
     wp.launch(kernels.lay, dim=local.shape, inputs=[laid], device=batch.device)
+    for array in self.own.values():
+      zero = wp.zeros((1, array.shape[1]), dtype=wp.float64, device=batch.device)
+      inputs = [laid.mask, zero, array]
+      wp.launch(kernels.put_back_rows, dim=array.shape, inputs=inputs, device=batch.device)
 
   @functools.cached_property
   def _holding(self) -> dict[str, Any]:

@@ -292,6 +292,10 @@ def test_a_thread_keeps_its_bends_as_under_the_plugin(device):
   worlds.step(10)
   first, second = worlds.thread("t").xpos.numpy()
   np.testing.assert_array_equal(first, second)
+  worlds.thread("t").lay(np.tile(one.line(31, 0.03), (2, 1, 1)), np.array([True, False]))
+  for world, kept in ((0, False), (1, True)):
+    worlds.get_state(world, other)
+    assert palpate.Thread(model, other, "t").rest_curvature.any() == kept
   worlds.reset()
   worlds.get_state(1, other)
   assert not palpate.Thread(model, other, "t").rest_curvature.any()
