@@ -40,6 +40,8 @@ def bind(w: Workspace, model: int):
       w.triangles = shared.of(model, w.data)
       w.triangles.join(model)
       w.cuts.bind(model, w.triangles, w.plugin_state)
+      if w.turn is not None:
+        w.turn.bind(model, w.triangles, w.organ.window)
     near = wp.get_device(does.side)
     crossing = device != near
 
@@ -79,8 +81,6 @@ def bind(w: Workspace, model: int):
       ahead = graphs.record_all((near, does.enter_ahead), (device, solve))
       w.graphs.resident.begin_graph = ahead[0][1]
       w.graphs.resident.rest = graphs.record_all((near, does.look_ahead))
-    if w.turn is not None and w.triangles:
-      w.turn.bind(model, w.triangles, w.organ.window)
   _watch(w, model)
 
 

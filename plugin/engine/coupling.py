@@ -180,14 +180,12 @@ def wrap(address: int, shape: Any, dtype: type = wp.float64) -> wp.array:
 
 def mujoco_arrays(model: int, data: int, kind: Any = Mujoco):
   """Returns `Mujoco`, or what has MuJoCo's names in another struct, for an mjModel and mjData."""
-  m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
-  triangles = shared.of(model, data).elem
+  m = mjstruct.Model.from_address(shared.of(model, data).model(model))
+  d = mjstruct.Data.from_address(data)
   option, start = type(m.opt), model + mjstruct.Model.opt.offset
   out = kind()
   for name, dims in DIMS[kind.key].items():
-    if name == "flex_elem":
-      address = triangles.ctypes.data
-    elif hasattr(option, name):
+    if hasattr(option, name):
       address = start + getattr(option, name).offset
     elif hasattr(m, name) or hasattr(d, name):
       address = getattr(m if hasattr(m, name) else d, name)

@@ -90,8 +90,7 @@ class Cuts:
     self._found: Any = self._own["stamp"].data
     self._triangles = triangles
     self._theirs = flexes.element_data(m, organ.flex)
-    first = int(m.flex_elemdataadr[organ.flex])
-    self._elem = triangles.elem[first:][: self._theirs.size].reshape(self._theirs.shape)
+    self._elem = flexes.element_data(mjstruct.model(triangles.model(model)), organ.flex)
     self._elem[:] = self.mesh.elem[: self.whole.nelem]
     self._border = np.flatnonzero(self.whole.twin < 0)
     self._rim = flexes.rim_data(m, organ.flex, len(self._border))
