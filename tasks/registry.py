@@ -1,19 +1,20 @@
 """The exercises by name, and their ids in Gymnasium.
 
-    @exercise("touch/easy", 10, "easy")
-    def easy(**kwargs):
-      "Touch one point within 5 mm."
-      return Touch(points=1, tolerance=0.005, **kwargs)
+    @exercise("touch/easy", 10, "easy", asks="Touch one point within 5 mm.", points=1)
+    @exercise("touch/standard", 30, asks="Touch four points within 3 mm.", points=4)
+    class Touch(Task):
 
-adds one, wherever the module is; a module of another package is found if it is an entry point of
+adds two, wherever the module is; a module of another package is found if it is an entry point of
 the group `palpate.tasks`. A domain's standard task is `palpate/Touch-v0` in Gymnasium, the others
 `palpate/TouchEasy-v0`, `palpate/ProbePalpateHard-v0` and so on. A change that changes returns gets
 a new version.
 """
 
 import dataclasses
+import functools
 import importlib.metadata
 import inspect
+import itertools
 import math
 import re
 from collections.abc import Callable
@@ -36,30 +37,37 @@ class Entry:
     tags: of `TAGS`
     make: makes the task, from its keyword arguments
     summary: what it asks for, in a line
+    number: tasks of a domain are in the order of these
   """
 
   name: str
   time_limit: float
   tags: tuple[str, ...]
-  make: Callable[..., Any]
+  make: functools.partial
   summary: str
+  number: int
 
 
 ENTRIES: dict[str, Entry] = {}  # by name
 TASKS: dict[str, tuple[str, ...]] = {}  # domain -> its tasks
+_NUMBERS = itertools.count()
 
 
-def exercise(name: str, time_limit: float, *tags: str) -> Callable:
-  """Returns a decorator that registers the function that makes a task.
+def exercise(
+  name: str, time_limit: float, *tags: str, asks: str | None = None, **defaults: Any
+) -> Callable:
+  """Returns a decorator that registers what makes a task: its class, or a function.
 
   Args:
     name: domain and task, such as "touch/easy"
     time_limit: of an episode [s]
     *tags: of `TAGS`
+    asks: what the task asks for, in a line; the first one of the docstring by default
+    **defaults: arguments that the task is made with unless others are given
 
   Raises:
-    ValueError: the name is taken or no name, the limit is not a duration, a tag is unknown, or the
-      function has no docstring: its first line is what the task asks for.
+    ValueError: the name is taken or no name, the limit is not a duration, a tag is unknown, or
+      nothing says what the task asks for.
   """
   if not isinstance(name, str) or not (parts := _NAME.fullmatch(name)):
     raise ValueError(f'exercise is {name!r}, expected "domain/task" in lower case')
@@ -70,20 +78,21 @@ def exercise(name: str, time_limit: float, *tags: str) -> Callable:
     if tag not in TAGS:
       raise ValueError(f"{name}: tag is {tag!r}, expected one of {', '.join(TAGS)}")
 
-  def add(make: Callable[..., Any]) -> Callable[..., Any]:
-    text = inspect.getdoc(make)
-    if not text:
-      raise ValueError(f"{name}: {make.__name__} has no docstring, expected what the task asks for")
-    known = ENTRIES.get(name)
-    if known and (known.make.__module__, known.make.__qualname__) != (
-      make.__module__, make.__qualname__
-    ):  # fmt: skip
-      where = f"{known.make.__module__}.{known.make.__name__}"
-      raise ValueError(f"{name}: it is registered already, by {where}")
-    summary = text.splitlines()[0].rstrip(".")
-    ENTRIES[name] = Entry(name, float(time_limit), tags, make, summary)
+  place = next(_NUMBERS)  # of the decorators of a class the first is called last
+
+  def add(make: Any) -> Any:
+    if not (text := inspect.cleandoc(asks or make.__doc__ or "")):
+      raise ValueError(f"{name}: {make.__name__} has no docstring, expected one, or `asks`")
+    where = f"{make.__module__}.{make.__qualname__}"
+    if name in ENTRIES:
+      func = ENTRIES[name].make.func
+      if (known := f"{func.__module__}.{func.__qualname__}") != where:
+        raise ValueError(f"{name}: it is registered already, by {known}")
+    summary, made = text.splitlines()[0].rstrip("."), functools.partial(make, **defaults)
+    ENTRIES[name] = Entry(name, float(time_limit), tags, made, summary, place)
     domain, task = parts.groups()
-    TASKS[domain] = tuple(dict.fromkeys((*TASKS.get(domain, ()), task)))
+    own = {*TASKS.get(domain, ()), task}
+    TASKS[domain] = tuple(sorted(own, key=lambda each: ENTRIES[f"{domain}/{each}"].number))
     for other in sorted(TASKS):  # in the order of the domains, not of imports
       TASKS[other] = TASKS.pop(other)
     _register(domain, task)

@@ -80,7 +80,7 @@ def _allowed(task: object) -> set[str]:
   for kind in type(task).__mro__[:-1]:
     parameters = inspect.signature(kind.__init__).parameters.values()
     names |= {p.name for p in parameters if p.kind is p.KEYWORD_ONLY}
-  return names - {"name"}
+  return names - {"name", "scene"}
 
 
 @functools.lru_cache(maxsize=1)  # each takes memory

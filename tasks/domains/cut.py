@@ -53,27 +53,6 @@ _SPEED, _DEEP, _OVER = 0.012, 0.0035, 0.012
 _BEYOND = 10  # points of the line that it goes on beyond where it began
 
 
-@exercise("cut/easy", 40, "easy")
-def easy(**kwargs):
-  """Cut out a circle of 24 mm within 3 mm of its line."""
-  kwargs = {"radius": 0.012, "tolerance": 0.003, **kwargs}
-  return Cut(dataclasses.replace(SCENE, nodes=400), **kwargs)
-
-
-@exercise("cut/standard", 60)
-def standard(**kwargs):
-  """Cut out a circle of 40 mm within 2 mm, as FLS asks for."""
-  kwargs = {"radius": 0.02, "jitter": 0.003, **kwargs}
-  return Cut(dataclasses.replace(SCENE, nodes=600), **kwargs)
-
-
-@exercise("cut/hard", 80, "hard")
-def hard(**kwargs):
-  """Cut out a clover of 36 mm within 1.5 mm."""
-  kwargs = {"radius": 0.018, "wave": 0.2, "tolerance": 0.0015, "jitter": 0.005, **kwargs}
-  return Cut(dataclasses.replace(SCENE, nodes=1000), **kwargs)
-
-
 def line(radius: float, wave: float, start: float) -> tuple[np.ndarray, float]:
   """Returns points of the line around the middle, (n, 3), and its length [m].
 
@@ -243,6 +222,13 @@ def mark(s, o, k):
   return o.curve[at] + r.vector(0.0, 0.0, ABOVE), r.HIDDEN if o.cut[at] > 0 else look
 
 
+@exercise("cut/easy", 40, "easy", asks="Cut out a circle of 24 mm within 3 mm of its line",
+          scene=dataclasses.replace(SCENE, nodes=400), radius=0.012, tolerance=0.003)  # fmt: skip
+@exercise("cut/standard", 60, asks="Cut out a circle of 40 mm within 2 mm, as FLS asks for",
+          scene=dataclasses.replace(SCENE, nodes=600), radius=0.02, jitter=0.003)  # fmt: skip
+@exercise("cut/hard", 80, "hard", asks="Cut out a clover of 36 mm within 1.5 mm",
+          scene=dataclasses.replace(SCENE, nodes=1000), radius=0.018, wave=0.2, tolerance=0.0015,
+          jitter=0.005)  # fmt: skip
 class Cut(Task):
   """Cut out a marked piece."""
 
@@ -275,8 +261,6 @@ class Cut(Task):
 
   def __init__(
     self,
-    scene: Scene,
-    random=None,
     *,
     name: str,
     radius: float,
@@ -288,8 +272,6 @@ class Cut(Task):
     """Makes the task.
 
     Args:
-      scene: of the exercise
-      random: see Task
       name: domain and task
       radius: of the line [m]
       wave: by how much that comes and goes, three times around [-]
@@ -307,8 +289,7 @@ class Cut(Task):
       raise ValueError(f"{name}: traction is {traction}, expected a number > 0 [N]")
     self.radius, self.wave, self.tolerance, self.limit = radius, wave, tolerance, traction
     self.room = len(line(radius, wave, 0.0)[0]) + 4  # another may have a point or two more
-    kwargs = {"force_limit": 0.8, "damage": 2.0, **kwargs}
-    super().__init__(scene, random, name=name, **kwargs)
+    super().__init__(name=name, **{"force_limit": 0.8, "damage": 2.0, **kwargs})
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene, which has no other shapes."""

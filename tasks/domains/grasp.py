@@ -58,28 +58,6 @@ LOOSE = 0.045  # what it gains at rest in jaws without force [-]
 GRIPS = {"grip": "closing", "held": "grasped"}  # see `Rules.columns`
 
 
-@exercise("grasp/easy", 20, "easy")
-def easy(**kwargs):
-  """Lift the fundus by 6 mm for 0.5 s."""
-  kwargs = {"lift": 0.006, "hold": 0.5, **kwargs}
-  return Grasp(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
-
-
-@exercise("grasp/standard", 30)
-def standard(**kwargs):
-  """Lift the fundus by 8 mm for 1 s."""
-  kwargs = {"lift": 0.008, "hold": 1.0, "jitter": 0.003, **kwargs}
-  return Grasp(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
-
-
-@exercise("grasp/hard", 40, "hard")
-def hard(**kwargs):
-  """Lift the fundus by 10 mm for 2 s with less force, on varying organs."""
-  kwargs = {"lift": 0.01, "hold": 2.0, "jitter": 0.005, "variants": (None, 1, 2), **kwargs}
-  kwargs = {"force_limit": 3.4, "damage": 6.0, **kwargs}
-  return Grasp(dataclasses.replace(FUNDUS, nodes=500), **kwargs)
-
-
 class Held:
   """State of jaws that are to hold a site."""
 
@@ -284,6 +262,15 @@ def mark(s, o, k):
   return r.point(s, o.site), r.LATER
 
 
+@exercise("grasp/easy", 20, "easy", asks="Lift the fundus by 6 mm for 0.5 s",
+          scene=dataclasses.replace(FUNDUS, nodes=250), lift=0.006, hold=0.5)  # fmt: skip
+@exercise("grasp/standard", 30, asks="Lift the fundus by 8 mm for 1 s",
+          scene=dataclasses.replace(FUNDUS, nodes=250), lift=0.008, hold=1.0,
+          jitter=0.003)  # fmt: skip
+@exercise("grasp/hard", 40, "hard",
+          asks="Lift the fundus by 10 mm for 2 s with less force, on varying organs",
+          scene=dataclasses.replace(FUNDUS, nodes=500), lift=0.01, hold=2.0, jitter=0.005,
+          variants=(None, 1, 2), force_limit=3.4, damage=6.0)  # fmt: skip
 class Grasp(Hold):
   """Grasp, lift, hold, lower, release."""
 
@@ -292,20 +279,17 @@ class Grasp(Hold):
     shaping=shaping, mark=mark,
   )  # fmt: skip
 
-  def __init__(self, scene: Scene, random=None, *, lift: float, hold: float, **kwargs):
+  def __init__(self, *, lift: float, hold: float, **kwargs):
     """Makes the task.
 
     Args:
-      scene: of the exercise
-      random: see Task
       lift: height to lift the site to [m]
       hold: how long to hold it there [s]
       **kwargs: see Task; the force limit counts the jaws too
     """
     self.lift, self.hold = lift, hold
     self.slip = 0.5 * lift
-    kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
-    super().__init__(scene, random, **kwargs)
+    super().__init__(**{"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs})
 
   def begin(self, physics: Physics) -> None:
     """Draws the site."""

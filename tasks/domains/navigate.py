@@ -42,28 +42,6 @@ _SWING, _RATE = (0.14, 0.14, 0.006), (0.5, 0.9)  # of the instrument [rad, m], [
 _HOVER = 0.03  # of its tip over the place of work [m]
 
 
-@exercise("navigate/easy", 40, "easy")
-def easy(**kwargs):
-  """Show two marks with optics of 0 degrees, centred and level."""
-  kwargs = {"marks": 2, "centre": 0.3, "tilt": 15.0, "band": (0.05, 0.1), **kwargs}
-  return Navigate(dataclasses.replace(FIELD, nodes=250, optics=0.0), **kwargs)
-
-
-@exercise("navigate/standard", 80)
-def standard(**kwargs):
-  """Show three marks along their pins with optics of 30 degrees, centred and level."""
-  kwargs = {"marks": 3, "centre": 0.25, "tilt": 10.0, "band": (0.05, 0.08), "lean": 12.0, **kwargs}
-  return Navigate(dataclasses.replace(FIELD, nodes=250), **{"jitter": 0.005, **kwargs})
-
-
-@exercise("navigate/hard", 120, "hard")
-def hard(**kwargs):
-  """Show three marks along their pins, then follow an instrument for 8 s, on varying livers."""
-  kwargs = {"marks": 3, "centre": 0.2, "tilt": 7.0, "band": (0.05, 0.075), "lean": 10.0, **kwargs}
-  kwargs = {"follow": 8.0, "jitter": 0.01, "variants": (None, 1, 2), **kwargs}
-  return Navigate(dataclasses.replace(FIELD, nodes=500, guided="probe"), **kwargs)
-
-
 class State:
   """State of a world."""
 
@@ -250,6 +228,20 @@ def mark(s, o, k):
   return at, r.shown(of, o.done)
 
 
+@exercise("navigate/easy", 40, "easy",
+          asks="Show two marks with optics of 0 degrees, centred and level",
+          scene=dataclasses.replace(FIELD, nodes=250, optics=0.0), marks=2, centre=0.3, tilt=15.0,
+          band=(0.05, 0.1))  # fmt: skip
+@exercise("navigate/standard", 80,
+          asks="Show three marks along their pins with optics of 30 degrees, centred and level",
+          scene=dataclasses.replace(FIELD, nodes=250), marks=3, centre=0.25, tilt=10.0,
+          band=(0.05, 0.08), lean=12.0, jitter=0.005)  # fmt: skip
+@exercise(
+  "navigate/hard", 120, "hard",
+  asks="Show three marks along their pins, then follow an instrument for 8 s, on varying livers",
+  scene=dataclasses.replace(FIELD, nodes=500, guided="probe"), marks=3, centre=0.2, tilt=7.0,
+  band=(0.05, 0.075), lean=10.0, follow=8.0, jitter=0.01, variants=(None, 1, 2),
+)  # fmt: skip
 class Navigate(Task):
   """Show marks with a laparoscope."""
 
@@ -268,8 +260,6 @@ class Navigate(Task):
 
   def __init__(
     self,
-    scene: Scene,
-    random=None,
     *,
     marks: int,
     centre: float,
@@ -283,8 +273,6 @@ class Navigate(Task):
     """Makes the task.
 
     Args:
-      scene: of the exercise
-      random: see Task
       marks: how many to show
       centre: how far from the picture's middle, as a share of half its height
       tilt: largest angle against the horizon [deg]
@@ -299,8 +287,7 @@ class Navigate(Task):
     self.facing, self.per = math.cos(math.radians(lean)), 1 if lean >= 180 else 2
     self.hold, self.follow, self.half = hold, follow, math.tan(FOVY / 2)
     self.targets = marks * self.per
-    kwargs = {"spread": 0.045, "force_limit": 0.5, **kwargs}
-    super().__init__(scene, random, **kwargs)
+    super().__init__(**{"spread": 0.045, "force_limit": 0.5, **kwargs})
 
   def begin(self, physics: Physics) -> None:
     """Draws the marks, the sides that they are seen from, and the instrument's way."""

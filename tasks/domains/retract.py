@@ -26,7 +26,6 @@ from palpate.tissue.types import Array
 from ..core import rules as r
 from ..core.base import Physics
 from ..core.performer import Performer, Script
-from ..core.scenes import Scene
 from ..registry import exercise
 from .grasp import FUNDUS, GRIPS, READY, Held, Hold, follow, near, ready
 from .touch import SLACK
@@ -35,28 +34,6 @@ _BEHIND = 0.02  # from the organ's middle to the disc [m]
 SAMPLES = 12  # points of the disc
 _GRIP = 1.8  # of the expert, more than to lift: what is pulled aside slides [N]
 SEEN = 1e-6  # what rounding may take from a share of it
-
-
-@exercise("retract/easy", 20, "easy")
-def easy(**kwargs):
-  """Uncover half of a disc of 3 mm for 0.5 s."""
-  kwargs = {"radius": 0.003, "wanted": 0.5, "hold": 0.5, **kwargs}
-  return Retract(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
-
-
-@exercise("retract/standard", 30)
-def standard(**kwargs):
-  """Uncover 80 % of a disc of 4 mm for 1 s."""
-  kwargs = {"radius": 0.004, "wanted": 0.8, "hold": 1.0, "jitter": 0.003, **kwargs}
-  return Retract(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
-
-
-@exercise("retract/hard", 40, "hard")
-def hard(**kwargs):
-  """Uncover a disc of 4 mm for 2 s with less force, on varying organs."""
-  kwargs = {"radius": 0.004, "wanted": 1.0, "hold": 2.0, "jitter": 0.005, **kwargs}
-  kwargs = {"variants": (None, 1, 2), "force_limit": 3.4, "damage": 6.0, **kwargs}
-  return Retract(dataclasses.replace(FUNDUS, nodes=500), **kwargs)
 
 
 class State(Held):
@@ -123,6 +100,16 @@ def mark(s, o, k):
   return r.point(s, o.site), r.LATER
 
 
+@exercise("retract/easy", 20, "easy", asks="Uncover half of a disc of 3 mm for 0.5 s",
+          scene=dataclasses.replace(FUNDUS, nodes=250), radius=0.003, wanted=0.5,
+          hold=0.5)  # fmt: skip
+@exercise("retract/standard", 30, asks="Uncover 80 % of a disc of 4 mm for 1 s",
+          scene=dataclasses.replace(FUNDUS, nodes=250), radius=0.004, wanted=0.8, hold=1.0,
+          jitter=0.003)  # fmt: skip
+@exercise("retract/hard", 40, "hard",
+          asks="Uncover a disc of 4 mm for 2 s with less force, on varying organs",
+          scene=dataclasses.replace(FUNDUS, nodes=500), radius=0.004, wanted=1.0, hold=2.0,
+          jitter=0.005, variants=(None, 1, 2), force_limit=3.4, damage=6.0)  # fmt: skip
 class Retract(Hold):
   """Pull tissue aside and hold it."""
 
@@ -132,22 +119,17 @@ class Retract(Hold):
   )  # fmt: skip
   targets = 2
 
-  def __init__(
-    self, scene: Scene, random=None, *, radius: float, wanted: float, hold: float, **kwargs
-  ):
+  def __init__(self, *, radius: float, wanted: float, hold: float, **kwargs):
     """Makes the task.
 
     Args:
-      scene: of the exercise
-      random: see Task
       radius: of the hidden disc [m]
       wanted: share of the disc that must be seen [-]
       hold: for how long [s]
       **kwargs: see Task; the force limit counts the jaws too
     """
     self.radius, self.wanted, self.hold = radius, wanted, hold
-    kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
-    super().__init__(scene, random, **kwargs)
+    super().__init__(**{"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs})
 
   def begin(self, physics: Physics) -> None:
     """Draws the site to grasp and hides the disc behind the organ's edge, far from the trocar."""

@@ -25,26 +25,6 @@ CONTACT, DWELL = 0.03, 0.1  # least force and time of a touch [N], [s]
 SLACK = 1e-5  # what rounding may take from times [s]
 
 
-@exercise("touch/easy", 10, "easy")
-def easy(**kwargs):
-  """Touch one point within 5 mm."""
-  return Touch(1, 0.005, Scene(nodes=250), **kwargs)
-
-
-@exercise("touch/standard", 30)
-def standard(**kwargs):
-  """Touch four points within 3 mm."""
-  kwargs = {"jitter": 0.005, **kwargs}
-  return Touch(4, 0.003, Scene(nodes=500), **kwargs)
-
-
-@exercise("touch/hard", 40, "hard")
-def hard(**kwargs):
-  """Touch six points within 2 mm, on livers that vary."""
-  kwargs = {"jitter": 0.01, "variants": (None, 1, 2), "damage": 2.0, **kwargs}
-  return Touch(6, 0.002, Scene(nodes=1000), **kwargs)
-
-
 class State:
   """State of a world."""
 
@@ -120,24 +100,28 @@ def mark(s, o, k):
   return r.point(s, o.goals[k]), r.shown(k, o.done)
 
 
+@exercise("touch/easy", 10, "easy", asks="Touch one point within 5 mm",
+          scene=Scene(nodes=250), points=1, tolerance=0.005)  # fmt: skip
+@exercise("touch/standard", 30, asks="Touch four points within 3 mm",
+          scene=Scene(nodes=500), points=4, tolerance=0.003, jitter=0.005)  # fmt: skip
+@exercise("touch/hard", 40, "hard", asks="Touch six points within 2 mm, on livers that vary",
+          scene=Scene(nodes=1000), points=6, tolerance=0.002, jitter=0.01, variants=(None, 1, 2),
+          damage=2.0)  # fmt: skip
 class Touch(Task):
   """Touch points in order."""
 
   rules = r.Rules(State, advance, observe, ("target", "normal", "held"), mark=mark)
 
-  def __init__(self, points: int, tolerance: float, scene: Scene, random=None, **kwargs):
+  def __init__(self, *, points: int, tolerance: float, **kwargs):
     """Makes the task.
 
     Args:
       points: how many to touch
       tolerance: largest distance from tip to point [m]
-      scene: of the exercise
-      random: see Task
       **kwargs: see Task
     """
     self.targets, self.tolerance = points, tolerance
-    kwargs = {"spread": 0.035, "force_limit": 0.5, **kwargs}
-    super().__init__(scene, random, **kwargs)
+    super().__init__(**{"spread": 0.035, "force_limit": 0.5, **kwargs})
 
   def begin(self, physics: Physics) -> None:
     """Draws the points, apart from each other."""

@@ -42,28 +42,6 @@ MARKS = 30  # spheres that draw the curve
 LEAD = 4  # of them that show where to begin or to go on, and which way: one is a pixel from afar
 
 
-@exercise("trace/easy", 20, "easy")
-def easy(**kwargs):
-  """Trace an arc of about 40 mm within 5 mm."""
-  kwargs = {"size": 0.02, "turns": 0.0, "tolerance": 0.005, **kwargs}
-  return Trace(dataclasses.replace(STOMACH, nodes=250), **kwargs)
-
-
-@exercise("trace/standard", 30)
-def standard(**kwargs):
-  """Trace an S of about 60 mm within 3.5 mm."""
-  kwargs = {"size": 0.025, "turns": 1.0, "tolerance": 0.0035, "jitter": 0.005, **kwargs}
-  return Trace(dataclasses.replace(STOMACH, nodes=500), **kwargs)
-
-
-@exercise("trace/hard", 40, "hard")
-def hard(**kwargs):
-  """Trace a double S of about 80 mm within 3 mm, on stomachs that vary."""
-  kwargs = {"size": 0.026, "turns": 2.0, "tolerance": 0.003, "jitter": 0.005, **kwargs}
-  kwargs = {"variants": (None, 1, 2), "force_limit": 0.5, "damage": 2.0, **kwargs}
-  return Trace(dataclasses.replace(STOMACH, nodes=1000), **kwargs)
-
-
 class State:
   """State of a world."""
 
@@ -254,6 +232,16 @@ def mark(s, o, k):
   return place(s, o, at), r.NOW if begins else look
 
 
+@exercise("trace/easy", 20, "easy", asks="Trace an arc of about 40 mm within 5 mm",
+          scene=dataclasses.replace(STOMACH, nodes=250), size=0.02, turns=0.0,
+          tolerance=0.005)  # fmt: skip
+@exercise("trace/standard", 30, asks="Trace an S of about 60 mm within 3.5 mm",
+          scene=dataclasses.replace(STOMACH, nodes=500), size=0.025, turns=1.0, tolerance=0.0035,
+          jitter=0.005)  # fmt: skip
+@exercise("trace/hard", 40, "hard",
+          asks="Trace a double S of about 80 mm within 3 mm, on stomachs that vary",
+          scene=dataclasses.replace(STOMACH, nodes=1000), size=0.026, turns=2.0, tolerance=0.003,
+          jitter=0.005, variants=(None, 1, 2), force_limit=0.5, damage=2.0)  # fmt: skip
 class Trace(Task):
   """Follow a curve in light contact."""
 
@@ -262,22 +250,17 @@ class Trace(Task):
   targets = MARKS
   rules = r.Rules(State, advance, observe, ("target", "ahead"), shaping=shaping, mark=mark)
 
-  def __init__(
-    self, scene: Scene, random=None, *, size: float, turns: float, tolerance: float, **kwargs
-  ):
+  def __init__(self, *, size: float, turns: float, tolerance: float, **kwargs):
     """Makes the task.
 
     Args:
-      scene: of the exercise
-      random: see Task
       size: half the width of the curve [m]
       turns: how often it waves; 0 is an arc
       tolerance: largest distance of the tip from the curve [m]
       **kwargs: see Task
     """
     self.size, self.turns, self.tolerance = size, turns, tolerance
-    kwargs = {"spread": 0.03, **kwargs}
-    super().__init__(scene, random, **kwargs)
+    super().__init__(**{"spread": 0.03, **kwargs})
 
   def begin(self, physics: Physics) -> None:
     """Draws the curve: a wave in the plane across the shaft, dropped on the surface."""

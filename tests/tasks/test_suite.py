@@ -57,6 +57,7 @@ def test_tasks_and_tags():
   assert set(tasks.BENCHMARKING) == set(tasks.ALL_TASKS)
   assert set(tasks.EASY) | set(tasks.HARD) < set(tasks.ALL_TASKS)
   assert suite.TASKS_BY_DOMAIN == registry.TASKS  # what is read is what is there
+  assert registry.TASKS["probe"][:4] == ("easy", "standard", "hard", "depth")  # as written
 
 
 def test_unknown_names_list_the_choices():

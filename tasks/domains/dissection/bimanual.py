@@ -58,28 +58,6 @@ _BURNING = 0.2  # share of that time after which somebody should step in
 _FAR, _MORE, _SHARE, OFF, _WAITS, NEAR, _NEARER = 0.03, 0.3, 0.7, 0.0005, 0.01, 0.92, 0.8
 
 
-@exercise("bimanual/easy", 40, "easy", "bimanual")
-def easy(**kwargs):
-  """Hold the gallbladder and divide half of its bed with a hook."""
-  return Bimanual(SCENE, **{"wanted": 0.5, **kwargs})
-
-
-@exercise("bimanual/standard", 60, "bimanual")
-def standard(**kwargs):
-  """Divide 80 % of it."""
-  kwargs = {"wanted": 0.8, "jitter": 0.003, **kwargs}
-  return Bimanual(SCENE, **kwargs)
-
-
-@exercise("bimanual/hard", 80, "hard", "bimanual")
-def hard(**kwargs):
-  """Divide 90 % of it with less force, on varying organs."""
-  kwargs = {"wanted": 0.9, "jitter": 0.005, "variants": (None, 1, 2), **kwargs}
-  kwargs = {"force_limit": 3.4, "damage": 6.0, "traction": 1.2, **kwargs}
-  scene = dataclasses.replace(SCENE, nodes=500)
-  return Bimanual(scene, **kwargs)
-
-
 class State(dissect.State):
   """State of a world."""
 
@@ -203,6 +181,15 @@ def observe(s, o):
   return o
 
 
+@exercise("bimanual/easy", 40, "easy", "bimanual",
+          asks="Hold the gallbladder and divide half of its bed with a hook",
+          scene=SCENE, wanted=0.5)  # fmt: skip
+@exercise("bimanual/standard", 60, "bimanual", asks="Divide 80 % of it",
+          scene=SCENE, wanted=0.8, jitter=0.003)  # fmt: skip
+@exercise("bimanual/hard", 80, "hard", "bimanual",
+          asks="Divide 90 % of it with less force, on varying organs",
+          scene=dataclasses.replace(SCENE, nodes=500), wanted=0.9, jitter=0.005,
+          variants=(None, 1, 2), force_limit=3.4, damage=6.0, traction=1.2)  # fmt: skip
 class Bimanual(Dissect):
   """Retract with one hand, dissect with the other."""
 

@@ -23,7 +23,6 @@ import numpy as np
 from ...core import rules as r
 from ...core.base import Physics
 from ...core.performer import Performer, Script
-from ...core.scenes import Scene
 from ...registry import exercise
 from ..grasp import FUNDUS, GRIPS, Held, Hold, distance, follow
 from .freeing import COLUMNS, METRICS, Freed, Freeing, count, earned, held, holding
@@ -34,31 +33,6 @@ BED, TOUGH = (1e7, 6e3, 8.0), (1e7, 7e3, 10.0)
 RIP = 0.025  # speed of a pull from which on what comes free is torn [m/s]
 # Of the expert: how far it pulls at most [m], how fast [m/s], and how much towards the trocar.
 _FAR, _SPEED, _UP = 0.045, 0.01, 0.5
-
-
-@exercise("dissect/easy", 30, "easy")
-def easy(**kwargs):
-  """Free half of the gallbladder's bed."""
-  kwargs = {"wanted": 0.5, **kwargs}
-  scene = dataclasses.replace(FUNDUS, nodes=250, bonds=BED)
-  return Dissect(scene, **kwargs)
-
-
-@exercise("dissect/standard", 40)
-def standard(**kwargs):
-  """Free 80 % of it."""
-  kwargs = {"wanted": 0.8, "jitter": 0.003, **kwargs}
-  scene = dataclasses.replace(FUNDUS, nodes=250, bonds=BED)
-  return Dissect(scene, **kwargs)
-
-
-@exercise("dissect/hard", 60, "hard")
-def hard(**kwargs):
-  """Free 85 % of a tough bed with less force, on varying organs."""
-  kwargs = {"wanted": 0.85, "jitter": 0.005, "variants": (None, 1, 2), **kwargs}
-  kwargs = {"force_limit": 3.4, "damage": 6.0, "traction": 1.2, **kwargs}
-  scene = dataclasses.replace(FUNDUS, nodes=500, bonds=TOUGH)
-  return Dissect(scene, **kwargs)
 
 
 class State(Held, Freed):
@@ -114,6 +88,15 @@ def mark(s, o, k):
   return r.point(s, o.site), r.NOW
 
 
+@exercise("dissect/easy", 30, "easy", asks="Free half of the gallbladder's bed",
+          scene=dataclasses.replace(FUNDUS, nodes=250, bonds=BED), wanted=0.5)  # fmt: skip
+@exercise("dissect/standard", 40, asks="Free 80 % of it",
+          scene=dataclasses.replace(FUNDUS, nodes=250, bonds=BED), wanted=0.8,
+          jitter=0.003)  # fmt: skip
+@exercise("dissect/hard", 60, "hard",
+          asks="Free 85 % of a tough bed with less force, on varying organs",
+          scene=dataclasses.replace(FUNDUS, nodes=500, bonds=TOUGH), wanted=0.85, jitter=0.005,
+          variants=(None, 1, 2), force_limit=3.4, damage=6.0, traction=1.2)  # fmt: skip
 class Dissect(Freeing, Hold):
   """Free an organ from its bed by traction."""
 
@@ -123,19 +106,10 @@ class Dissect(Freeing, Hold):
   )  # fmt: skip
   slip = 0.006
 
-  def __init__(self, scene: Scene, random=None, *, wanted: float, traction: float = 1.5, **kwargs):
-    """Makes the task.
-
-    Args:
-      scene: of the exercise, with bonds
-      random: see Task
-      wanted: share of the bed that must come free cleanly [-]
-      traction: limit of the pull on the liver [N]
-      **kwargs: see Task; the force limit counts the jaws too
-    """
-    kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
-    kwargs |= {"wanted": wanted, "traction": traction}
-    super().__init__(scene, random, **kwargs)
+  def __init__(self, **kwargs):
+    """Makes the task, see `Freeing`; the force limit counts the jaws too."""
+    limits = {"force_limit": 4.0, "damage": 8.0, "traction": 1.5}
+    super().__init__(**{"spread": 0.012, **limits, **kwargs})
 
   def begin(self, physics: Physics) -> None:
     """Draws the site to grasp."""

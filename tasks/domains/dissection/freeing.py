@@ -6,7 +6,7 @@ import numpy as np
 
 from ...core import rules as r
 from ...core.base import Physics, Task
-from ...core.scenes import FILM, RAW, Scene, films
+from ...core.scenes import FILM, RAW, films
 
 SEEN = 1e-5  # what rounding may take from a share, in float32 too
 
@@ -86,12 +86,10 @@ class Freeing(Task):
   wanted: float
   limit: float
 
-  def __init__(self, scene: Scene, random=None, *, wanted: float, traction: float, **kwargs):
+  def __init__(self, *, wanted: float, traction: float, **kwargs):
     """Makes the task.
 
     Args:
-      scene: of the exercise, with bonds
-      random: see Task
       wanted: share of their area that must come free as it should [-]
       traction: limit of the pull on what the organ is bonded to [N]
       **kwargs: see Task
@@ -101,7 +99,7 @@ class Freeing(Task):
     if not 0 < traction < math.inf:
       raise ValueError(f"traction is {traction}, expected a number > 0 [N]")
     self.wanted, self.limit = wanted, traction
-    super().__init__(scene, random, **kwargs)
+    super().__init__(**kwargs)
 
   def whole(self, physics: Physics) -> None:
     """Begins with bonds that are whole."""

@@ -36,26 +36,6 @@ _UNDER, _LOW = 0.02, 0.005  # from the front and the bed at most, of a tip under
 ROW = 0.5 * _LANE  # bonds of the front are no farther from the first of them [m]
 
 
-@exercise("tease/easy", 40, "easy")
-def easy(**kwargs):
-  """Free 40 % of a filmy adhesion."""
-  return Tease(SCENE, **{"wanted": 0.4, "law": FILMY, **kwargs})
-
-
-@exercise("tease/standard", 60)
-def standard(**kwargs):
-  """Free half of it."""
-  kwargs = {"wanted": 0.5, "law": FILMY, "jitter": 0.003, **kwargs}
-  return Tease(SCENE, **kwargs)
-
-
-@exercise("tease/hard", 80, "hard")
-def hard(**kwargs):
-  """Free 60 % of a dense one with less force."""
-  kwargs = {"wanted": 0.6, "law": DENSE, "jitter": 0.005, "force_limit": 1.2, **kwargs}
-  return Tease(SCENE, **kwargs)
-
-
 class State(Freed):
   """State of a world."""
 
@@ -112,6 +92,12 @@ def mark(s, o, k):
   return o.front, r.NOW
 
 
+@exercise("tease/easy", 40, "easy", asks="Free 40 % of a filmy adhesion",
+          scene=SCENE, wanted=0.4, law=FILMY)  # fmt: skip
+@exercise("tease/standard", 60, asks="Free half of it",
+          scene=SCENE, wanted=0.5, law=FILMY, jitter=0.003)  # fmt: skip
+@exercise("tease/hard", 80, "hard", asks="Free 60 % of a dense one with less force",
+          scene=SCENE, wanted=0.6, law=DENSE, jitter=0.005, force_limit=1.2)  # fmt: skip
 class Tease(Freeing):
   """Free a strip by blunt strokes."""
 
@@ -121,28 +107,15 @@ class Tease(Freeing):
   )
   slots = 24
 
-  def __init__(
-    self,
-    scene: Scene,
-    random=None,
-    *,
-    wanted: float,
-    law: tuple[float, float, float],
-    traction: float = 2.0,
-    **kwargs,
-  ):
+  def __init__(self, *, scene: Scene, law: tuple[float, float, float], **kwargs):
     """Makes the task.
 
     Args:
       scene: of the exercise
-      random: see Task
-      wanted: share of the strip that must come free cleanly [-]
       law: stiffness [N/m^3], strength [Pa] and energy [J/m^2] of what holds it
-      traction: limit of the pull on what is under it [N]
-      **kwargs: see Task
+      **kwargs: see `Freeing`
     """
-    kwargs |= {"wanted": wanted, "traction": traction}
-    super().__init__(dataclasses.replace(scene, bonds=law), random, **kwargs)
+    super().__init__(scene=dataclasses.replace(scene, bonds=law), **{"traction": 2.0, **kwargs})
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene, which has no other shapes."""

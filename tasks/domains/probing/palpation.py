@@ -112,22 +112,10 @@ class Palpate(Task):
   )
   final = ("report",)
 
-  def __init__(
-    self,
-    scene: Scene,
-    random=None,
-    *,
-    name: str,
-    factor: float,
-    radius: float,
-    tolerance: float,
-    **kwargs,
-  ):
+  def __init__(self, *, name: str, factor: float, radius: float, tolerance: float, **kwargs):
     """Makes the task.
 
     Args:
-      scene: of the exercise
-      random: see Task
       name: domain and task
       factor: stiffness of the inclusion over that of the organ [-]
       radius: of the inclusion [m]
@@ -142,8 +130,7 @@ class Palpate(Task):
       raise ValueError(
         f"{name}: model is given, expected none: the organ is made with its inclusion"
       )
-    kwargs = {"spread": 0.036, **kwargs}
-    super().__init__(scene, random, name=name, **kwargs)
+    super().__init__(name=name, **{"spread": 0.036, **kwargs})
 
   @property
   def extra(self) -> tuple[str, ...]:

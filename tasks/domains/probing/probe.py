@@ -36,65 +36,12 @@ from ...core.performer import Performer, Script
 from ...core.scenes import Scene
 from ...registry import exercise
 from ..touch import SLACK, draw_apart
-from .palpation import Palpate
+from . import palpation
 
 KIDNEY = Scene(
   organ="kidney", center="anterior", port=(0.03, 0.045, 0.12), camera=(-0.05, 0.12, 0.1)
 )
 PRESSES, LEAVES = 0.1, 0.02  # force above which a press begins, and below which it ends [N]
-
-
-@exercise("probe/easy", 15, "easy")
-def easy(**kwargs):
-  """Press one site with 0.3 to 0.7 N for 0.5 s."""
-  kwargs = {"sites": 1, "band": (0.3, 0.7), "hold": 0.5, "tolerance": 0.008, **kwargs}
-  return Press(Scene(nodes=250), **kwargs)
-
-
-@exercise("probe/standard", 40)
-def standard(**kwargs):
-  """Press three sites with 0.4 to 0.6 N for 1 s each."""
-  kwargs = {"sites": 3, "band": (0.4, 0.6), "hold": 1.0, "jitter": 0.005, **kwargs}
-  return Press(Scene(nodes=500), **kwargs)
-
-
-@exercise("probe/hard", 60, "hard")
-def hard(**kwargs):
-  """Press four sites with 0.45 to 0.55 N for 2 s each, on livers that vary."""
-  kwargs = {"sites": 4, "band": (0.45, 0.55), "hold": 2.0, "jitter": 0.01, **kwargs}
-  kwargs = {"variants": (None, 1, 2), "force_limit": 0.8, "damage": 2.0, **kwargs}
-  return Press(Scene(nodes=1000), **kwargs)
-
-
-@exercise("probe/depth", 40)
-def depth(**kwargs):
-  """Press three sites 4 to 6 mm deep for 1 s each."""
-  kwargs = {"sites": 3, "band": (0.004, 0.006), "hold": 1.0, "jitter": 0.005, **kwargs}
-  return Press(Scene(nodes=500), by_depth=True, **kwargs)
-
-
-@exercise("probe/palpate_easy", 40, "easy")
-def palpate_easy(**kwargs):
-  """Find an inclusion ten times as stiff, within 8 mm."""
-  kwargs = {"factor": 10.0, "radius": 0.012, "tolerance": 0.008, **kwargs}
-  return Palpate(dataclasses.replace(KIDNEY, nodes=250), **kwargs)
-
-
-@exercise("probe/palpate_standard", 60)
-def palpate_standard(**kwargs):
-  """Find an inclusion eight times as stiff, within 8 mm."""
-  kwargs = {"factor": 8.0, "radius": 0.01, "tolerance": 0.008, "jitter": 0.003, **kwargs}
-  scene = dataclasses.replace(KIDNEY, nodes=500)
-  return Palpate(scene, **kwargs)
-
-
-@exercise("probe/palpate_hard", 60, "hard")
-def palpate_hard(**kwargs):
-  """Find an inclusion five times as stiff, within 7 mm, on varying kidneys."""
-  kwargs = {"factor": 5.0, "radius": 0.009, "tolerance": 0.007, "jitter": 0.005, **kwargs}
-  kwargs = {"variants": (None, 1, 2), "force_limit": 1.0, **kwargs}
-  scene = dataclasses.replace(KIDNEY, nodes=1000)
-  return Palpate(scene, **kwargs)
 
 
 class State:
@@ -184,6 +131,17 @@ def mark(s, o, k):
   return o.points[k], r.shown(k, o.done)
 
 
+@exercise("probe/easy", 15, "easy", asks="Press one site with 0.3 to 0.7 N for 0.5 s",
+          scene=Scene(nodes=250), sites=1, band=(0.3, 0.7), hold=0.5, tolerance=0.008)  # fmt: skip
+@exercise("probe/standard", 40, asks="Press three sites with 0.4 to 0.6 N for 1 s each",
+          scene=Scene(nodes=500), sites=3, band=(0.4, 0.6), hold=1.0, jitter=0.005)  # fmt: skip
+@exercise("probe/hard", 60, "hard",
+          asks="Press four sites with 0.45 to 0.55 N for 2 s each, on livers that vary",
+          scene=Scene(nodes=1000), sites=4, band=(0.45, 0.55), hold=2.0, jitter=0.01,
+          variants=(None, 1, 2), force_limit=0.8, damage=2.0)  # fmt: skip
+@exercise("probe/depth", 40, asks="Press three sites 4 to 6 mm deep for 1 s each",
+          scene=Scene(nodes=500), by_depth=True, sites=3, band=(0.004, 0.006), hold=1.0,
+          jitter=0.005)  # fmt: skip
 class Press(Task):
   """Press sites into a band of force or depth and hold."""
 
@@ -191,8 +149,6 @@ class Press(Task):
 
   def __init__(
     self,
-    scene: Scene,
-    random=None,
     *,
     sites: int,
     band: tuple[float, float],
@@ -204,8 +160,6 @@ class Press(Task):
     """Makes the task.
 
     Args:
-      scene: of the exercise
-      random: see Task
       sites: how many to press
       band: of force [N] or depth [m]
       hold: how long to stay in the band [s]
@@ -216,8 +170,7 @@ class Press(Task):
     self.targets, self.band, self.hold = sites, band, hold
     self.low, self.high = band
     self.tolerance, self.by_depth = tolerance, by_depth
-    kwargs = {"spread": 0.035, **kwargs}
-    super().__init__(scene, random, **kwargs)
+    super().__init__(**{"spread": 0.035, **kwargs})
 
   def begin(self, physics: Physics) -> None:
     """Draws the sites, apart from each other."""
@@ -265,3 +218,19 @@ class Press(Task):
       else:
         yield from p.push(middle, -normal, until, most=6.0)
       yield from p.move(point + 0.008 * normal)
+
+
+@exercise("probe/palpate_easy", 40, "easy",
+          asks="Find an inclusion ten times as stiff, within 8 mm",
+          scene=dataclasses.replace(KIDNEY, nodes=250), factor=10.0, radius=0.012,
+          tolerance=0.008)  # fmt: skip
+@exercise("probe/palpate_standard", 60,
+          asks="Find an inclusion eight times as stiff, within 8 mm",
+          scene=dataclasses.replace(KIDNEY, nodes=500), factor=8.0, radius=0.01, tolerance=0.008,
+          jitter=0.003)  # fmt: skip
+@exercise("probe/palpate_hard", 60, "hard",
+          asks="Find an inclusion five times as stiff, within 7 mm, on varying kidneys",
+          scene=dataclasses.replace(KIDNEY, nodes=1000), factor=5.0, radius=0.009, tolerance=0.007,
+          jitter=0.005, variants=(None, 1, 2), force_limit=1.0)  # fmt: skip
+class Palpate(palpation.Palpate):
+  """Find what is stiff by touch."""

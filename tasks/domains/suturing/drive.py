@@ -65,25 +65,6 @@ _HELD_AT = math.radians(-65.0)  # along the arc from its middle [rad]
 _OVER, _MORE = 0.012, 0.0015
 
 
-@exercise("suture/drive_easy", 20, "easy")
-def easy(**kwargs):
-  """Drive a needle through two marks 12 mm apart, within 3 mm."""
-  return Drive(FIELD, **{"tolerance": 0.003, "turn": 10.0, **kwargs})
-
-
-@exercise("suture/drive_standard", 25)
-def standard(**kwargs):
-  """Drive it within 2 mm, in changing directions."""
-  return Drive(FIELD, **{"tolerance": 0.002, "turn": 25.0, "jitter": 0.003, **kwargs})
-
-
-@exercise("suture/drive_hard", 30, "hard")
-def hard(**kwargs):
-  """Drive it within 1 mm, as FLS asks for, through a tougher wall."""
-  kwargs = {"tolerance": 0.001, "turn": 25.0, "jitter": 0.005, "tough": 1200.0, **kwargs}
-  return Drive(FIELD, **kwargs)
-
-
 class State(Hands):
   """State of a world."""
 
@@ -145,6 +126,14 @@ def observe(s, o):
   return o
 
 
+@exercise("suture/drive_easy", 20, "easy",
+          asks="Drive a needle through two marks 12 mm apart, within 3 mm",
+          scene=FIELD, tolerance=0.003, turn=10.0)  # fmt: skip
+@exercise("suture/drive_standard", 25, asks="Drive it within 2 mm, in changing directions",
+          scene=FIELD, tolerance=0.002, turn=25.0, jitter=0.003)  # fmt: skip
+@exercise("suture/drive_hard", 30, "hard",
+          asks="Drive it within 1 mm, as FLS asks for, through a tougher wall",
+          scene=FIELD, tolerance=0.001, turn=25.0, jitter=0.005, tough=1200.0)  # fmt: skip
 class Drive(Stitching):
   """Drive a needle through two marks."""
 
@@ -159,29 +148,17 @@ class Drive(Stitching):
   )
   targets = 2
 
-  def __init__(
-    self,
-    scene: Scene,
-    random=None,
-    *,
-    tolerance: float,
-    turn: float,
-    tough: float = TOUGH,
-    **kwargs,
-  ):
+  def __init__(self, *, tolerance: float, turn: float, tough: float = TOUGH, **kwargs):
     """Makes the task.
 
     Args:
-      scene: of the exercise
-      random: see Task
       tolerance: largest distance of holes from their marks [m]
       turn: largest rotation of the bite about the vertical [deg]
       tough: energy that opens an area of the wall [J/m^2]
       **kwargs: see Task
     """
     self.tolerance, self.turn, self.tough = tolerance, math.radians(turn), tough
-    kwargs = {"force_limit": 2.0, "damage": 6.0, **kwargs}
-    super().__init__(scene, random, **kwargs)
+    super().__init__(**{"force_limit": 2.0, "damage": 6.0, **kwargs})
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: a wall in a frame, and the needle."""

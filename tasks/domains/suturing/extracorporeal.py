@@ -56,30 +56,21 @@ _THERE = 0.002  # from the mark, where throws are laid [m]
 _MARK = 0.018  # height of the mark over the drain [m]
 
 
-@exercise("suture/extracorporeal_easy", 15, "easy")
-def easy(**kwargs):
-  """Push one throw down, and close the slit to 1 mm."""
-  return Extracorporeal(FIELD, **{"turns": (1,), **kwargs})
-
-
-@exercise("suture/extracorporeal_standard", 30)
-def standard(**kwargs):
-  """Push down two throws, a square knot that holds 0.6 N."""
-  return Extracorporeal(FIELD, **{"turns": (1, 1), **kwargs})
-
-
-@exercise("suture/extracorporeal_hard", 45, "hard")
-def hard(**kwargs):
-  """Push down three throws, the first double, a surgeon's knot that holds 0.6 N."""
-  return Extracorporeal(FIELD, **{"turns": (2, 1, 1), **kwargs})
-
-
+@exercise("suture/extracorporeal_easy", 15, "easy",
+          asks="Push one throw down, and close the slit to 1 mm",
+          scene=FIELD, turns=(1,))  # fmt: skip
+@exercise("suture/extracorporeal_standard", 30,
+          asks="Push down two throws, a square knot that holds 0.6 N",
+          scene=FIELD, turns=(1, 1))  # fmt: skip
+@exercise("suture/extracorporeal_hard", 45, "hard",
+          asks="Push down three throws, the first double, a surgeon's knot that holds 0.6 N",
+          scene=FIELD, turns=(2, 1, 1))  # fmt: skip
 class Extracorporeal(drain.Sewn):
   """Push throws down with a knot pusher."""
 
-  def __init__(self, scene: Scene, random=None, **kwargs):
+  def __init__(self, **kwargs):
     """Makes the task; see `Sewn`."""
-    super().__init__(scene, random, **{"force_limit": 3.0, "damage": 6.0, **kwargs})
+    super().__init__(**{"force_limit": 3.0, "damage": 6.0, **kwargs})
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: the drain, its thread, and a slide for each of its ends."""

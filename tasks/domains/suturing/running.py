@@ -111,25 +111,6 @@ _UNDRAWN = 0.013  # slack of the seam that a teacher goes on to draw in [m]
 _OVER, _TAUT, _WAY = 0.02, 0.3, np.array([0.6, 0.35, 0.72])
 
 
-@exercise("suture/running_easy", 40, "easy", "bimanual")
-def easy(**kwargs):
-  """Place the last of four stitches within 3 mm of its marks, and close the cut."""
-  return Running(FIELD, **{"placed": 3, "tolerance": 0.003, **kwargs})
-
-
-@exercise("suture/running_standard", 80, "bimanual")
-def standard(**kwargs):
-  """Place two of four stitches within 2 mm of their marks, and close the cut."""
-  return Running(FIELD, **{"placed": 2, "tolerance": 0.002, "jitter": 0.002, **kwargs})
-
-
-@exercise("suture/running_hard", 150, "hard", "bimanual")
-def hard(**kwargs):
-  """Place three of them within 1.5 mm, in the wall of a stomach that is stretched more."""
-  kwargs = {"tension": 50.0, "over": ("stomach", "body"), **kwargs}
-  return Running(FIELD, **{"placed": 1, "tolerance": 0.0015, "jitter": 0.003, **kwargs})
-
-
 class State(Taking):
   """State of a world."""
 
@@ -250,6 +231,16 @@ def mark(s, o, k):
   return place(s, o, k) + r.vector(0.0, 0.0, MARK), r.shown(k, o.holes)
 
 
+@exercise("suture/running_easy", 40, "easy", "bimanual",
+          asks="Place the last of four stitches within 3 mm of its marks, and close the cut",
+          scene=FIELD, placed=3, tolerance=0.003)  # fmt: skip
+@exercise("suture/running_standard", 80, "bimanual",
+          asks="Place two of four stitches within 2 mm of their marks, and close the cut",
+          scene=FIELD, placed=2, tolerance=0.002, jitter=0.002)  # fmt: skip
+@exercise("suture/running_hard", 150, "hard", "bimanual",
+          asks="Place three of them within 1.5 mm, in the wall of a stomach that is stretched more",
+          scene=FIELD, tension=50.0, over=("stomach", "body"), placed=1, tolerance=0.0015,
+          jitter=0.003)  # fmt: skip
 class Running(Stitching):
   """Close a cut with a running suture."""
 
@@ -269,9 +260,8 @@ class Running(Stitching):
 
   def __init__(
     self,
-    scene: Scene,
-    random=None,
     *,
+    scene: Scene,
     placed: int,
     tolerance: float,
     close: float = CLOSED,
@@ -283,7 +273,6 @@ class Running(Stitching):
 
     Args:
       scene: of the exercise
-      random: see Task
       placed: number of the four stitches that are placed at the start
       tolerance: largest distance of holes from their marks [m]
       close: largest gap of a closed cut [m]
@@ -295,8 +284,7 @@ class Running(Stitching):
     self.tension, self.over = tension, over
     self.edges = sheet.slit(*sheet.sheet(kwargs.get("nodes") or scene.nodes), CUT)[2]
     self.pairs = len(self.edges)
-    kwargs = {"force_limit": 3.0, "damage": 8.0, **kwargs}
-    super().__init__(scene, random, **kwargs)
+    super().__init__(scene=scene, **{"force_limit": 3.0, "damage": 8.0, **kwargs})
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: a wall with a cut in a frame, and the needle with its thread."""

@@ -95,18 +95,6 @@ _NEAR, _LOOK, _THROUGH = math.radians(25.0), 0.3, math.radians(185.0)
 _TUG, _ASIDE = 0.02, 0.03
 
 
-@exercise("suture/stitch_easy", 60, "easy", "bimanual")
-def easy(**kwargs):
-  """Drive a needle through both lips of a slit within 2 mm of its marks, and tie one throw."""
-  return Stitch(FIELD, **{"turns": (1,), "tolerance": 0.002, **kwargs})
-
-
-@exercise("suture/stitch_standard", 60, "bimanual")
-def standard(**kwargs):
-  """Drive it within 1 mm, as FLS asks for, and tie a double throw."""
-  return Stitch(FIELD, **{"turns": (2,), "tolerance": 0.001, "jitter": 0.002, **kwargs})
-
-
 class State(knot.State, Hands):
   """State of a world."""
 
@@ -201,6 +189,14 @@ def observe(s, o):
   return o
 
 
+@exercise(
+  "suture/stitch_easy", 60, "easy", "bimanual",
+  asks="Drive a needle through both lips of a slit within 2 mm of its marks, and tie one throw",
+  scene=FIELD, turns=(1,), tolerance=0.002,
+)  # fmt: skip
+@exercise("suture/stitch_standard", 60, "bimanual",
+          asks="Drive it within 1 mm, as FLS asks for, and tie a double throw",
+          scene=FIELD, turns=(2,), tolerance=0.001, jitter=0.002)  # fmt: skip
 class Stitch(Knot, Stitching):
   """Drive a needle through a slit, draw its thread through, and tie a throw.
 
@@ -221,18 +217,16 @@ class Stitch(Knot, Stitching):
   )
   targets = 2
 
-  def __init__(self, scene: Scene, random=None, *, tolerance: float, **kwargs):
+  def __init__(self, *, tolerance: float, **kwargs):
     """Makes the task.
 
     Args:
-      scene: of the exercise
-      random: see Task
       tolerance: largest distance of holes from their marks [m]
       **kwargs: see `Knot`
     """
     self.tolerance = tolerance
     self.marks = drain.MIDDLE + np.outer([0.5, -0.5], [drain.BITE, 0.0, 0.0])
-    super().__init__(scene, random, **kwargs)
+    super().__init__(**kwargs)
 
   def build(self, variant: int | None, nodes: np.ndarray) -> mujoco.MjSpec:
     """Returns the tube, and the thread with its needle, away from it until an episode begins."""

@@ -82,26 +82,6 @@ _ENTERS, _HANDS, _TAKES = math.radians(20.0), math.radians(20.0), math.radians(6
 _BACK, _RISE = 0.014, 0.016  # out of a ring, and off the needle [m]
 
 
-@exercise("needle/transfer_easy", 25, "easy", "bimanual")
-def easy(**kwargs):
-  """Pass a needle through a ring of 12 mm into the other hand."""
-  return Transfer(FIELD, **{"rings": 1, "size": 0.006, "tilt": 10.0, **kwargs})
-
-
-@exercise("needle/transfer_standard", 45, "bimanual")
-def standard(**kwargs):
-  """Pass a needle through two rings of 10 mm, there and back."""
-  kwargs = {"rings": 2, "size": 0.005, "tilt": 15.0, "jitter": 0.003, **kwargs}
-  return Transfer(FIELD, **kwargs)
-
-
-@exercise("needle/transfer_hard", 70, "hard", "bimanual")
-def hard(**kwargs):
-  """Pass a needle through three rings of 8 mm, from hand to hand."""
-  kwargs = {"rings": 3, "size": 0.004, "tilt": 20.0, "jitter": 0.005, **kwargs}
-  return Transfer(FIELD, **kwargs)
-
-
 class State(Taking):
   """State of a world."""
 
@@ -210,6 +190,15 @@ def mark(s, o, k):
   return o.middles[k] + r.vector(0.0, 0.0, o.size + 0.005), r.shown(k, o.done)
 
 
+@exercise("needle/transfer_easy", 25, "easy", "bimanual",
+          asks="Pass a needle through a ring of 12 mm into the other hand",
+          scene=FIELD, rings=1, size=0.006, tilt=10.0)  # fmt: skip
+@exercise("needle/transfer_standard", 45, "bimanual",
+          asks="Pass a needle through two rings of 10 mm, there and back",
+          scene=FIELD, rings=2, size=0.005, tilt=15.0, jitter=0.003)  # fmt: skip
+@exercise("needle/transfer_hard", 70, "hard", "bimanual",
+          asks="Pass a needle through three rings of 8 mm, from hand to hand",
+          scene=FIELD, rings=3, size=0.004, tilt=20.0, jitter=0.005)  # fmt: skip
 class Transfer(Needlework):
   """Pass a needle through rings, from hand to hand."""
 
@@ -225,20 +214,17 @@ class Transfer(Needlework):
     mark=mark,
   )
 
-  def __init__(self, scene: Scene, random=None, *, rings: int, size: float, tilt: float, **kwargs):
+  def __init__(self, *, rings: int, size: float, tilt: float, **kwargs):
     """Makes the task.
 
     Args:
-      scene: of the exercise
-      random: see Task
       rings: number of rings
       size: their inner radius [m]
       tilt: largest rotation of the rings about the vertical [deg]
       **kwargs: see Task
     """
     self.targets, self.size, self.tilt = rings, size, math.radians(tilt)
-    kwargs = {"force_limit": 5.0, "damage": 20.0, **kwargs}
-    super().__init__(scene, random, **kwargs)
+    super().__init__(**{"force_limit": 5.0, "damage": 20.0, **kwargs})
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene with needle and rings."""
