@@ -8,7 +8,7 @@ from palpate.models import wrist
 from palpate.tasks import suite
 from palpate.tasks.core import episode, performer, rules, stage
 from palpate.tasks.domains import sheet
-from palpate.tasks.domains.suturing import running
+from palpate.tasks.domains.suturing import needles, running
 from palpate.tasks.recording import Recording
 
 
@@ -32,7 +32,7 @@ def test_an_episode_begins_with_loose_stitches_in_a_cut_that_gapes(easy):
   assert physics.thread.tension.max() < 0.01
   assert task.gap == pytest.approx(np.ptp(nodes[task.edges, 0], axis=1).max())
   assert 2e-3 < task.gap < 2.6e-3
-  swage = running.arc(physics, 0.0)
+  swage = needles.arc(physics, 0.0)
   np.testing.assert_allclose(physics.thread.positions[0], swage, atol=1e-6)
   at = running.place(physics, task, 7)
   np.testing.assert_allclose(at[:2], task.marks[7, :2], atol=2e-3)

@@ -13,21 +13,9 @@ import numpy as np
 import palpate
 from palpate.models import mjcf
 
+from ...core import rules as r
 from ...core import scenes
 from ...core.base import Physics, Task
-from ...core.rules import (
-  MISSED,
-  RUNNING,
-  SUCCESS,
-  apply,
-  clamp,
-  pierced,
-  settle,
-  snapped,
-  taut,
-  vector,
-  vertex,
-)
 from ...core.scenes import BED, ORGAN, Scene
 from .. import sheet
 from .needles import RADIUS as CIRCLE
@@ -189,9 +177,9 @@ def part(s, o, force):
   """
   each = force / float(o.wall.shape[0])
   for k in range(o.wall.shape[0]):
-    apply(s, o.wall[k, 0], each * vector(_OUT, 0.0, _UP))
-    apply(s, o.wall[k, 1], each * vector(-_OUT, 0.0, _UP))
-  settle(s)
+    r.apply(s, o.wall[k, 0], each * r.vector(_OUT, 0.0, _UP))
+    r.apply(s, o.wall[k, 1], each * r.vector(-_OUT, 0.0, _UP))
+  r.settle(s)
 
 
 def pull_test(s, o):
@@ -205,24 +193,24 @@ def pull_test(s, o):
     o.security = o.pulled
   gapes = o.left > CLOSED and o.free > _LET_GO - 1e-6
   if gapes or parted or o.gap > GAPE or o.pulled == _LAST:
-    return o, SUCCESS if o.security > PULL - 1e-6 else MISSED
+    return o, r.SUCCESS if o.security > PULL - 1e-6 else r.MISSED
   o.free = o.free + o.control_timestep
-  o.pulled = clamp(_RISES * (o.free - _LET_GO), 0.0, _LAST)
+  o.pulled = r.clamp(_RISES * (o.free - _LET_GO), 0.0, _LAST)
   part(s, o, o.pulled)
-  return o, RUNNING
+  return o, r.RUNNING
 
 
 def follow_stitch(s, o):
   """Finds the gap, the tension, and whether the thread is whole and in its holes; a rule."""
-  count, pull = pierced(s)
+  count, pull = r.pierced(s)
   o.whole = count == 2
-  o.broken = snapped(s)
-  o.tension = taut(s)
+  o.broken = r.snapped(s)
+  o.tension = r.taut(s)
   o.hardest = max(o.hardest, pull)
   o.tightest = max(o.tightest, o.tension)
   o.gap = 0.0
   for k in range(o.lips.shape[0]):
-    o.gap = max(o.gap, float(vertex(s, o.lips[k, 0])[0] - vertex(s, o.lips[k, 1])[0]))
+    o.gap = max(o.gap, float(r.vertex(s, o.lips[k, 0])[0] - r.vertex(s, o.lips[k, 1])[0]))
   if o.pulled == 0.0:
     o.left = o.gap
   return o

@@ -17,13 +17,10 @@ for half a second, a force of the needle on the wall above the damage limit, or 
 """
 
 import math
-from typing import Annotated, Any
 
 import mujoco
 import numpy as np
 import palpate
-import warp as wp
-from palpate.tissue.types import Array, floats
 
 from ...core import rules as r
 from ...core.base import Physics
@@ -31,28 +28,7 @@ from ...core.performer import Performer, Script
 from ...core.scenes import Scene
 from ...registry import exercise
 from .. import sheet
-from .needles import (
-  FRICTION,
-  LOST,
-  MEETS,
-  QUARTER,
-  RADIUS,
-  TOUGH,
-  WALL,
-  Hands,
-  Stitching,
-  approach,
-  arc,
-  grasped,
-  half_angle,
-  lowest,
-  mark_hole,
-  open_holes,
-  piercing,
-  right_grasp,
-  tip_angle,
-  turn_on,
-)
+from . import needles as n
 
 BITE = 0.012  # between the marks [m]; FLS: 5 mm on either side of a slit
 WANTED = 0.005  # how far the tip is to come out [m]
@@ -65,23 +41,15 @@ _HELD_AT = math.radians(-65.0)  # along the arc from its middle [rad]
 _OVER, _MORE = 0.012, 0.0015
 
 
-class State(Hands):
+class State(n.Driving):
   """State of a world."""
 
-  tolerance: float  # how far holes may be from their marks [m]
   damage: float  # [N]
-  marks: Annotated[Any, Array(wp.vec3, ("targets",))]  # [m]
-  misses: Annotated[Any, floats("targets")]  # how far the holes are from them [m]
-  start0: float  # how far the tip was from the first one at the start [m]
-  holes: int
   pull: float  # of the needle on the wall [N]
   pulled: float  # the largest so far [N]
   deepest: float  # how far the needle was under the wall [m]
-  target: r.Vector
   way: r.Vector
-  circle: r.Vector
   middle: r.Vector
-  pierced: float
   out: float
   holds: float
 
@@ -91,26 +59,26 @@ class State(Hands):
 
 def advance(s, o):
   """Follows the needle through the wall."""
-  o = grasped(s, o, right_grasp(s), 0.0)
+  o = n.grasped(s, o, n.right_grasp(s), 0.0)
   count, pull = r.pierced(s)
   o.pull = pull
   o.pulled = max(o.pulled, pull)
-  o, worst = open_holes(s, o, min(count, 2))
+  o, worst = n.open_holes(s, o, min(count, 2))
   if o.holes > 0:
-    o.deepest = max(o.deepest, -lowest(s))
+    o.deepest = max(o.deepest, -n.lowest(s))
   o.out = 0.0
   if o.holes == 2:
     _, along = r.pinhole(s, 1)
-    o.out = r.clamp((2.0 * QUARTER * RADIUS - along) / WANTED, 0.0, 1.0)
+    o.out = r.clamp((2.0 * n.QUARTER * n.RADIUS - along) / WANTED, 0.0, 1.0)
   if o.pull > o.damage:
     return o, -1.0, r.DAMAGED
-  far = r.length(arc(s, 1.0) - o.marks[min(o.holes, 1)])
+  far = r.length(n.arc(s, 1.0) - o.marks[min(o.holes, 1)])
   progress = 0.3 * r.closeness(far, o.start0)
   if o.holes == 1:
     progress = 0.4 + 0.2 * r.closeness(far, BITE)
   if o.holes == 2:
     progress = 0.7 + 0.3 * o.out
-  if worst > o.tolerance or o.loose > LOST:
+  if worst > o.tolerance or o.loose > n.LOST:
     return o, progress, r.MISSED
   return o, progress, r.SUCCESS if o.out >= 1.0 else r.RUNNING
 
@@ -118,7 +86,7 @@ def advance(s, o):
 def observe(s, o):
   """Finds where the needle is."""
   middle = r.needle_place(s, r.vector(0.0, 0.0, 0.0))
-  o.target = o.marks[min(o.holes, 1)] - arc(s, 1.0)
+  o.target = o.marks[min(o.holes, 1)] - n.arc(s, 1.0)
   o.circle = r.needle_place(s, r.vector(0.0, 0.0, 1.0)) - middle
   o.middle = middle - o.marks[0]
   o.pierced = float(o.holes)
@@ -134,7 +102,7 @@ def observe(s, o):
 @exercise("suture/drive_hard", 30, "hard",
           asks="Drive it within 1 mm, as FLS asks for, through a tougher wall",
           scene=FIELD, tolerance=0.001, turn=25.0, jitter=0.005, tough=1200.0)  # fmt: skip
-class Drive(Stitching):
+class Drive(n.Stitching):
   """Drive a needle through two marks."""
 
   rules = r.Rules(
@@ -144,11 +112,11 @@ class Drive(Stitching):
     ("target", "way", "circle", "middle", "pierced", "out", "holds"),
     metrics={"peak_traction": "pulled", "bite_depth": "deepest"},
     columns={"traction": "pull", "bite": "deepest"},
-    mark=mark_hole,
+    mark=n.mark_hole,
   )
   targets = 2
 
-  def __init__(self, *, tolerance: float, turn: float, tough: float = TOUGH, **kwargs):
+  def __init__(self, *, tolerance: float, turn: float, tough: float = n.TOUGH, **kwargs):
     """Makes the task.
 
     Args:
@@ -162,11 +130,11 @@ class Drive(Stitching):
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: a wall in a frame, and the needle."""
-    law = {"needles": f"needle {self.tough:g} {FRICTION:g}"}
-    spec = sheet.stretched(self._scene(variant), WALL | law, _MASS, slots=_SLOTS)
+    law = {"needles": f"needle {self.tough:g} {n.FRICTION:g}"}
+    spec = sheet.stretched(self._scene(variant), n.WALL | law, _MASS, slots=_SLOTS)
     self.meet(spec)
     apart = (0.1, 0.0, -0.05)  # until an episode begins
-    meets = {"contype": 1 | MEETS, "conaffinity": 1 | MEETS}
+    meets = {"contype": 1 | n.MEETS, "conaffinity": 1 | n.MEETS}
     palpate.add_needle(spec, pos=apart, quat=(1, 1, 0, 0), contact=meets)
     return spec
 
@@ -176,7 +144,7 @@ class Drive(Stitching):
     middle = np.array([*self.random.uniform(-0.005, 0.005, 2), 0.0])
     self.way = -np.array([math.cos(angle), math.sin(angle), 0.0])
     self.marks = middle + np.outer([-0.5, 0.5], BITE * self.way)
-    place, mat = piercing(self.marks, -half_angle(self.marks) - math.radians(20.0))
+    place, mat = n.piercing(self.marks, -n.half_angle(self.marks) - math.radians(20.0))
     place = place + np.array([0.0, 0.0, _OVER]) + self.random.uniform(-0.003, 0.003, 3)
     tip = self.take_up(physics, (place, mat), _HELD_AT, lean=0.15, along=0.1)
     self.holes, self.misses = 0, np.zeros(2)
@@ -194,8 +162,8 @@ class Drive(Stitching):
 
   def expert(self, p: Performer) -> Script:
     """Puts the needle over the first mark, and turns it about its circle through both."""
-    end = half_angle(self.marks) + (WANTED + _MORE) / RADIUS
+    end = n.half_angle(self.marks) + (WANTED + _MORE) / n.RADIUS
     if not self.holes:
-      yield from approach(p, self.marks, math.radians(12.0))
-    while tip_angle(p.physics, self.marks) <= end - 0.01:
-      yield from turn_on(p, self.marks, end)
+      yield from n.approach(p, self.marks, math.radians(12.0))
+    while n.tip_angle(p.physics, self.marks) <= end - 0.01:
+      yield from n.turn_on(p, self.marks, end)

@@ -6,12 +6,14 @@ it count from the swage, angles along its arc from the middle. It begins in the 
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
+import warp as wp
 from palpate.engine.model.flexes import matrix
 from palpate.models import trocar, wrist
+from palpate.tissue.types import Array, floats
 
 from ...core import rules as r
 from ...core.base import Physics, Task
@@ -59,6 +61,19 @@ class Hands:
   left_holds: float
   loose: float  # how long nobody has held it [s]
   regrasps: float
+
+
+class Driving(Hands):
+  """State of who drives it through marks of a wall, see `Stitching`."""
+
+  tolerance: float  # how far holes may be from their marks [m]
+  marks: Annotated[Any, Array(wp.vec3, ("targets",))]  # where they are at rest [m]
+  misses: Annotated[Any, floats("targets")]  # how far the holes are from them [m]
+  start0: float  # how far the tip was from the first one at the start [m]
+  holes: int
+  target: r.Vector
+  circle: r.Vector
+  pierced: float
 
 
 class Taking(Hands):

@@ -39,7 +39,7 @@ import palpate
 import scipy
 import warp as wp
 from palpate.models import trocar, wrist
-from palpate.tissue.types import Array, floats, ints
+from palpate.tissue.types import Array, ints
 
 from ...core import rules as r
 from ...core.base import Physics
@@ -48,43 +48,7 @@ from ...core.scenes import Scene
 from ...core.stage import STATE, Stage
 from ...registry import exercise
 from .. import sheet
-from .needles import (
-  FRICTION,
-  LEFT,
-  LOST,
-  MARK,
-  MEETS,
-  NARROW,
-  OUT,
-  QUARTER,
-  RADIUS,
-  RIGHT,
-  WALL,
-  Stitching,
-  Taking,
-  approach,
-  arc,
-  arrive,
-  carry,
-  come,
-  grasped,
-  half_angle,
-  in_jaws,
-  left_grasp,
-  let_go,
-  lingers,
-  lowest,
-  needle,
-  one,
-  open_holes,
-  over,
-  park,
-  piercing,
-  right_grasp,
-  take,
-  tip_angle,
-  turn_on,
-)
+from . import needles as n
 
 STITCHES, PITCH, BITE = 4, 0.006, 0.004  # [m]: between stitches, and from the edge of the cut
 TENSION = 40.0  # of the wall [N/m]
@@ -100,7 +64,7 @@ FIELD = Scene(
   second_port=(0.06, 0.1, 0.08), camera=(0.0, 0.04, 0.105), nodes=480,
 )  # fmt: skip
 # Where on the needle the hands take it, as shares.
-_BACK, _FRONT = (0.5 + angle / math.pi for angle, _ in (RIGHT, LEFT))
+_BACK, _FRONT = (0.5 + angle / math.pi for angle, _ in (n.RIGHT, n.LEFT))
 _MASS, _SLOTS = 0.004, 160  # of the wall [kg], and of its window
 # Of the expert: how high the needle is brought over the wall [m], and what it pulls with [N].
 _HIGH, _PULL = 0.012, 0.7
@@ -111,21 +75,16 @@ _UNDRAWN = 0.013  # slack of the seam that a teacher goes on to draw in [m]
 _OVER, _TAUT, _WAY = 0.02, 0.3, np.array([0.6, 0.35, 0.72])
 
 
-class State(Taking):
+class State(n.Taking, n.Driving):
   """State of a world."""
 
-  tolerance: float  # how far holes may be from their marks [m]
   damage: float  # [N]
   placed: int  # stitches that are placed at the start
   close: float  # gap of a closed cut [m]
   seat: Annotated[Any, ints("targets")]  # triangle of each mark
   shares: Annotated[Any, Array(wp.vec3, ("targets",))]  # of its corners
-  marks: Annotated[Any, Array(wp.vec3, ("targets",))]  # where they are at rest [m]
   lips: Annotated[Any, ints("pairs", 4)]  # triangle and corner of both lips at places of the cut
-  misses: Annotated[Any, floats("targets")]  # how far the holes are from their marks [m]
-  start0: float  # how far the tip was from the first mark at the start [m]
   gap0: float  # of the cut then [m]
-  holes: int
   done: int  # stitches that are placed
   closed: float  # how long the gap has been under the limit [s]
   pull: float  # of needle and thread on the wall [N]
@@ -133,11 +92,9 @@ class State(Taking):
   deepest: float  # how far the needle was under its first mark [m]
   tightest: float  # largest tension so far [N]
   torn: float  # how far a hole has torn at most [m]
-  target: r.Vector
   way: r.Vector
   middle: r.Vector
   stitches: float
-  pierced: float
   through: float
   gap: float
   tight: float
@@ -168,7 +125,7 @@ def widest(s, o):
 
 def advance(s, o):
   """Follows needle and thread through the wall, and the gap."""
-  o = grasped(s, o, right_grasp(s), left_grasp(s))
+  o = n.grasped(s, o, n.right_grasp(s), n.left_grasp(s))
   count, pull = r.pierced(s)
   o.pull = pull
   o.tight = r.taut(s)
@@ -177,13 +134,13 @@ def advance(s, o):
   number = o.marks.shape[0]
   for k in range(count):
     o.torn = max(o.torn, r.torn_at(s, k))
-  o, worst = open_holes(s, o, min(count, number))
+  o, worst = n.open_holes(s, o, min(count, number))
   if o.holes > 2 * o.done:
-    o.deepest = max(o.deepest, float(place(s, o, now(o))[2]) - lowest(s))
+    o.deepest = max(o.deepest, float(place(s, o, now(o))[2]) - n.lowest(s))
   o.through = 0.0
   if o.holes == 2 * o.done + 2:
     _, along = r.pinhole(s, o.holes - 1)
-    o.through = r.clamp(1.0 - along / (2.0 * QUARTER * RADIUS), 0.0, 1.0)
+    o.through = r.clamp(1.0 - along / (2.0 * n.QUARTER * n.RADIUS), 0.0, 1.0)
     if along < 0.0:
       o.done = o.done + 1
       o.through = 0.0
@@ -194,7 +151,7 @@ def advance(s, o):
   part = float(o.done - o.placed)
   if o.done < number // 2:
     first = now(o)
-    far = r.length(arc(s, 1.0) - place(s, o, first + min(max(o.holes - first, 0), 1)))
+    far = r.length(n.arc(s, 1.0) - place(s, o, first + min(max(o.holes - first, 0), 1)))
     if o.holes <= 2 * o.done:
       part = part + 0.3 * r.closeness(far, o.start0)
     elif o.holes == 2 * o.done + 1:
@@ -204,7 +161,7 @@ def advance(s, o):
   closing = r.clamp((o.gap0 - o.gap) / (o.gap0 - o.close), 0.0, 1.0)
   progress = 0.7 * part / float(todo) + 0.3 * closing * float(o.done) / float(number // 2)
   o.closed = o.closed + o.control_timestep if o.gap < o.close else 0.0
-  if count < 2 * o.done or worst > o.tolerance or o.loose > LOST:
+  if count < 2 * o.done or worst > o.tolerance or o.loose > n.LOST:
     return o, progress, r.MISSED
   if o.done == number // 2 and o.closed > HELD - 1e-5:
     return o, progress, r.SUCCESS
@@ -216,19 +173,19 @@ def observe(s, o):
   middle = r.needle_place(s, r.vector(0.0, 0.0, 0.0))
   first = now(o)
   start, end = place(s, o, first), place(s, o, first + 1)
-  o.target = place(s, o, first + min(max(o.holes - first, 0), 1)) - arc(s, 1.0)
+  o.target = place(s, o, first + min(max(o.holes - first, 0), 1)) - n.arc(s, 1.0)
   o.way = (end - start) / r.length(end - start)
   o.circle = r.needle_place(s, r.vector(0.0, 0.0, 1.0)) - middle
   o.middle = middle - start
   o.stitches = float(o.done)
   o.pierced = float(max(o.holes - 2 * o.done, 0))
   left = o.left_holds > o.right_holds
-  return in_jaws(s, o, 0 if left else 1, _BACK if left else _FRONT, 0.01)
+  return n.in_jaws(s, o, 0 if left else 1, _BACK if left else _FRONT, 0.01)
 
 
 def mark(s, o, k):
   """Marks the holes that are left, the next one in yellow."""
-  return place(s, o, k) + r.vector(0.0, 0.0, MARK), r.shown(k, o.holes)
+  return place(s, o, k) + r.vector(0.0, 0.0, n.MARK), r.shown(k, o.holes)
 
 
 @exercise("suture/running_easy", 40, "easy", "bimanual",
@@ -241,7 +198,7 @@ def mark(s, o, k):
           asks="Place three of them within 1.5 mm, in the wall of a stomach that is stretched more",
           scene=FIELD, tension=50.0, over=("stomach", "body"), placed=1, tolerance=0.0015,
           jitter=0.003)  # fmt: skip
-class Running(Stitching):
+class Running(n.Stitching):
   """Close a cut with a running suture."""
 
   rules = r.Rules(
@@ -288,7 +245,7 @@ class Running(Stitching):
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene: a wall with a cut in a frame, and the needle with its thread."""
-    tissue = WALL | {"needles": f"needle {_TOUGH:g} {FRICTION:g}", "tension": self.tension}
+    tissue = n.WALL | {"needles": f"needle {_TOUGH:g} {n.FRICTION:g}", "tension": self.tension}
     tissue |= {"foundation": _FILLING} if self.over else {}
     scene = self._scene(variant)
     spec = sheet.stretched(scene, tissue, _MASS, slots=_SLOTS, span=CUT, over=self.over)
@@ -296,11 +253,11 @@ class Running(Stitching):
     self.meet(spec)
     apart = np.array([0.1, 0.0, -0.05])  # until an episode begins
     nodes = (
-      apart + (0.0, 0.0, -RADIUS) + np.arange(round(THREAD / EDGE) + 1)[:, None] * (0, 0, -EDGE)
+      apart + (0.0, 0.0, -n.RADIUS) + np.arange(round(THREAD / EDGE) + 1)[:, None] * (0, 0, -EDGE)
     )
     meets = {"contype": 0, "conaffinity": 0}
     palpate.add_thread(spec, nodes, "suture", material="polypropylene", bead=_BEAD, contact=meets)
-    meets = {"contype": 1 | MEETS, "conaffinity": 1 | MEETS}
+    meets = {"contype": 1 | n.MEETS, "conaffinity": 1 | n.MEETS}
     palpate.add_needle(spec, pos=tuple(apart), quat=(1, 1, 0, 0), thread="suture", contact=meets)
     return spec
 
@@ -313,12 +270,12 @@ class Running(Stitching):
     organ = palpate.Organ(made.model, data, self.organ)
     seat, share = _seats(organ.xpos0, organ.elem, self._planned(organ.xpos0))
     at = (share[..., None] * organ.xpos[organ.elem[seat]]).sum(axis=1)
-    self.held = piercing(at[2 * self.placed :], -math.radians(60.0))
+    self.held = n.piercing(at[2 * self.placed :], -math.radians(60.0))
     self.held = self.held[0] + np.array([-0.003, 0.0, _HIGH]), self.held[1]
     pos, mat = self.held
     data.joint("needle").qpos[:] = np.concatenate([pos, trocar.orientation(mat)])
     mujoco.mj_forward(made.model, data)
-    line = _laid(at[: 2 * self.placed], pos - RADIUS * mat[:, 1])
+    line = _laid(at[: 2 * self.placed], pos - n.RADIUS * mat[:, 1])
     palpate.Thread(made.model, data, "suture").lay(line)
     organ.sew("needle")
     data.qvel[:] = 0
@@ -345,18 +302,18 @@ class Running(Stitching):
     self.closed = self.through = self.stitches = self.pierced = 0.0
     self.target, self.way, self.circle, self.middle = np.zeros((4, 3))
     self.gap = self.gap0 = widest(physics, self)
-    angle, tilt = RIGHT
+    angle, tilt = n.RIGHT
     tip = self.take_up(physics, self.held, angle, lean=0.0, along=0.08, side=-1.0, tilt=tilt)
     self.start0 = float(np.linalg.norm(tip - place(physics, self, first)))
     self.aims = -1, np.zeros((2, 3))  # of the expert, see `_ends`
     _, second = physics.hands
     port, aside = second.trocar(), self.random.uniform(-0.005, 0.005, 3)
-    pos, turn = park(port)
+    pos, turn = n.park(port)
     second.set_joints(wrist.inverse(port, pos + aside, turn))
 
   def label(self, kind: str) -> str:
     """Returns what an event of the rules is called."""
-    lost = self.loose > LOST or self.misses.max() > self.tolerance
+    lost = self.loose > n.LOST or self.misses.max() > self.tolerance
     return "a stitch came out" if kind == "missed" and not lost else super().label(kind)
 
   def instruct(self, physics: Physics) -> str:
@@ -376,20 +333,20 @@ class Running(Stitching):
     while self.outcome is None:
       out = self.holes == 2 * self.done + 2
       if self.done == STITCHES:
-        yield from one(p, p.other, self._pull(p.other, lambda: self.outcome is not None))
-      elif out and self.left_holds and (self.right_holds or lingers(p)):
-        yield from one(p, p, let_go(p))
+        yield from n.one(p, p.other, self._pull(p.other, lambda: self.outcome is not None))
+      elif out and self.left_holds and (self.right_holds or n.lingers(p)):
+        yield from n.one(p, p, n.let_go(p))
       elif self.left_holds and (out or (p.hasty and self._seam(p.physics) > _UNDRAWN)):
-        yield from one(p, p.other, self._draw(p.other))
-      elif not out and self.right_holds and (self.left_holds or lingers(p.other)):
-        yield from one(p, p.other, let_go(p.other))
+        yield from n.one(p, p.other, self._draw(p.other))
+      elif not out and self.right_holds and (self.left_holds or n.lingers(p.other)):
+        yield from n.one(p, p.other, n.let_go(p.other))
       elif self.left_holds:
-        yield from one(p, p.other, self._hand(p.other))
-        yield from one(p, p, take(p, *RIGHT))
-      elif self.right_holds and out and self._angle(p) > OUT - 0.1:
-        yield from one(p, p.other, take(p.other, *LEFT))
+        yield from n.one(p, p.other, self._hand(p.other))
+        yield from n.one(p, p, n.take(p, *n.RIGHT))
+      elif self.right_holds and out and self._angle(p) > n.OUT - 0.1:
+        yield from n.one(p, p.other, n.take(p.other, *n.LEFT))
       elif self.right_holds:
-        yield from one(p, p, self._drive(p))
+        yield from n.one(p, p, self._drive(p))
       else:
         yield from p.wait(0.1)
 
@@ -405,24 +362,24 @@ class Running(Stitching):
 
   def _angle(self, p: Performer) -> float:
     """Returns the angle of the needle's tip, see `piercing`."""
-    return tip_angle(p.physics, self._ends(p))
+    return n.tip_angle(p.physics, self._ends(p))
 
   def _drive(self, p: Performer) -> Script:
     """Puts the needle over the first mark, and turns it about its circle through both."""
     if self.holes <= 2 * self.done:
-      yield from approach(p, self._ends(p), math.radians(14.0))
-    while self.holes < 2 * self.done + 2 or self._angle(p) < OUT - 0.02:
-      yield from turn_on(p, self._ends(p), max(OUT, self._angle(p) + 0.2))
+      yield from n.approach(p, self._ends(p), math.radians(14.0))
+    while self.holes < 2 * self.done + 2 or self._angle(p) < n.OUT - 0.02:
+      yield from n.turn_on(p, self._ends(p), max(n.OUT, self._angle(p) + 0.2))
 
   def _draw(self, p: Performer) -> Script:
     """Turns the needle out of the wall, and draws the thread after it."""
-    end = half_angle(self._ends(p)) + math.radians(185.0)
+    end = n.half_angle(self._ends(p)) + math.radians(185.0)
 
     def inside() -> bool:
       return self.holes == 2 * self.done + 2
 
     while inside() and self._angle(p) < end - 0.05:
-      yield from turn_on(p, self._ends(p), end)
+      yield from n.turn_on(p, self._ends(p), end)
     while inside():  # not of a hole that is lost
       yield from p.line(p.tip + np.array([0.001, 0.0, 0.002]), 0.02)
     # Who has closed the cut pulls no harder, see below.
@@ -430,16 +387,16 @@ class Running(Stitching):
 
   def _hand(self, p: Performer) -> Script:
     """Brings the needle over the next stitch, to where the right hand can take it."""
-    up, (pos, mat) = np.array([0.0, 0.0, 1.0]), piercing(self._ends(p), math.radians(90.0))
+    up, (pos, mat) = np.array([0.0, 0.0, 1.0]), n.piercing(self._ends(p), math.radians(90.0))
     goal = pos + _OVER * up, mat
 
     def there() -> bool:
-      return over(p, needle(p.physics), goal, up)
+      return n.over(p, n.needle(p.physics), goal, up)
 
-    yield from come(carry(p, lambda t: (goal[0] + 0.01 * up, mat)), there)
-    if not there() or needle(p.physics)[0][2] > goal[0][2] + NARROW:
-      yield from carry(p, lambda t: goal)
-      yield from arrive(p)
+    yield from n.come(n.carry(p, lambda t: (goal[0] + 0.01 * up, mat)), there)
+    if not there() or n.needle(p.physics)[0][2] > goal[0][2] + n.NARROW:
+      yield from n.carry(p, lambda t: goal)
+      yield from n.arrive(p)
 
   def _pull(self, p: Performer, enough: Callable[[], bool]) -> Script:
     """Draws the thread through until it has little slack, and pulls at it until that is enough."""
@@ -460,7 +417,7 @@ class Running(Stitching):
   def _slack(self, physics: Any) -> float:
     """Returns how much longer the thread is from its first hole to the needle than the way [m]."""
     holes = physics.needle().holes
-    way = np.array([*(hole.at for hole in holes), arc(physics, 0.0)])
+    way = np.array([*(hole.at for hole in holes), n.arc(physics, 0.0)])
     return -holes[0].along - _along(way) if holes else 0.0
 
   def _seam(self, physics: Any) -> float:

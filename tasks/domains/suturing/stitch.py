@@ -23,13 +23,10 @@ is on its thread, and what fails in `knot`.
 """
 
 import math
-from typing import Annotated, Any
 
 import mujoco
 import numpy as np
-import warp as wp
 from palpate.models import wrist
-from palpate.tissue.types import Array, floats
 
 from ...core import rules as r
 from ...core.base import Physics
@@ -38,37 +35,9 @@ from ...core.scenes import Scene
 from ...core.stage import Stage
 from ...registry import exercise
 from . import drain, knot
+from . import needles as n
 from .drain import BITE
 from .knot import BEYOND, Knot, follow, judge, see_tails
-from .needles import (
-  LEFT,
-  LOST,
-  OUT,
-  QUARTER,
-  RADIUS,
-  RIGHT,
-  WIDE,
-  Hands,
-  Stitching,
-  approach,
-  arc,
-  arrive,
-  carry,
-  grasped,
-  half_angle,
-  jaws,
-  left_grasp,
-  let_go,
-  mark_hole,
-  one,
-  open_holes,
-  park,
-  piercing,
-  right_grasp,
-  take,
-  tip_angle,
-  turn_on,
-)
 from .tie import HOLD, Tie
 
 FIELD = Scene(
@@ -95,23 +64,15 @@ _NEAR, _LOOK, _THROUGH = math.radians(25.0), 0.3, math.radians(185.0)
 _TUG, _ASIDE = 0.02, 0.03
 
 
-class State(knot.State, Hands):
+class State(knot.State, n.Driving):
   """State of a world."""
 
-  tolerance: float  # how far holes may be from their marks [m]
-  marks: Annotated[Any, Array(wp.vec3, ("targets",))]  # [m]
-  misses: Annotated[Any, floats("targets")]  # how far the holes are from them [m]
-  start0: float  # how far the tip was from the first one at the start [m]
-  holes: int
   worst: float  # how far a hole is from its mark at most [m]
   torn: float  # how far a hole has torn at most [m]
   placed: bool  # whether the needle is through
   right_needle: float  # whether a hand holds the needle; right_holds tells of the thread too
   left_needle: float
-  target: r.Vector
-  circle: r.Vector
   needle: r.Vector
-  pierced: float
   attached: float  # whether the needle is on its thread
 
 
@@ -132,7 +93,7 @@ def look(s, o):
   count, _pull = r.pierced(s)
   for k in range(count):
     o.torn = max(o.torn, r.torn_at(s, k))
-  o, worst = open_holes(s, o, min(count, 2))
+  o, worst = n.open_holes(s, o, min(count, 2))
   o.worst = worst
   if o.whole and not o.placed:
     _, along = r.pinhole(s, 1)
@@ -140,11 +101,11 @@ def look(s, o):
   if not o.placed:
     o.whole = True
     o.tied = 0.0
-  right, left = right_grasp(s), left_grasp(s)
+  right, left = n.right_grasp(s), n.left_grasp(s)
   if o.attached > 0.0:
     o.right_holds = o.right_needle
     o.left_holds = o.left_needle
-    o = grasped(s, o, right, left)
+    o = n.grasped(s, o, right, left)
     o.right_needle = right
     o.left_needle = left
     if r.tugged(s, _BESIDE) > _OFF:
@@ -161,7 +122,7 @@ def advance(s, o):
   """Follows the stitch; see the module's head."""
   o = look(s, o)
   o, progress, outcome = judge(s, o)
-  dropped = o.attached > 0.0 and o.loose > LOST
+  dropped = o.attached > 0.0 and o.loose > n.LOST
   if outcome == r.RUNNING and (dropped or o.worst > o.tolerance):
     outcome = r.MISSED
   if outcome != r.RUNNING or o.tied > 0.0:
@@ -170,8 +131,8 @@ def advance(s, o):
     return o, 0.3 if o.attached > 0.0 else 0.4, outcome
   if o.holes == 2:
     _, along = r.pinhole(s, 1)
-    return o, 0.2 + 0.1 * r.clamp(1.0 - along / (2.0 * QUARTER * RADIUS), 0.0, 1.0), outcome
-  far = r.length(arc(s, 1.0) - o.marks[o.holes])
+    return o, 0.2 + 0.1 * r.clamp(1.0 - along / (2.0 * n.QUARTER * n.RADIUS), 0.0, 1.0), outcome
+  far = r.length(n.arc(s, 1.0) - o.marks[o.holes])
   start = BITE if o.holes > 0 else o.start0
   return o, 0.1 * (float(o.holes) + r.closeness(far, start)), outcome
 
@@ -182,7 +143,7 @@ def observe(s, o):
   o.right_holds = max(float(o.firm[0]), o.attached * o.right_needle)
   o.left_holds = max(float(o.firm[1]), o.attached * o.left_needle)
   middle = r.needle_place(s, r.vector(0.0, 0.0, 0.0))
-  o.target = o.marks[min(o.holes, 1)] - arc(s, 1.0)
+  o.target = o.marks[min(o.holes, 1)] - n.arc(s, 1.0)
   o.circle = r.needle_place(s, r.vector(0.0, 0.0, 1.0)) - middle
   o.needle = middle - r.tip(s)
   o.pierced = float(o.holes)
@@ -197,7 +158,7 @@ def observe(s, o):
 @exercise("suture/stitch_standard", 60, "bimanual",
           asks="Drive it within 1 mm, as FLS asks for, and tie a double throw",
           scene=FIELD, turns=(2,), tolerance=0.001, jitter=0.002)  # fmt: skip
-class Stitch(Knot, Stitching):
+class Stitch(Knot, n.Stitching):
   """Drive a needle through a slit, draw its thread through, and tie a throw.
 
   Attributes:
@@ -213,7 +174,7 @@ class Stitch(Knot, Stitching):
     metrics={**Knot.rules.metrics, "tearing": "torn", "regrasps": "regrasps"},
     begin=begin,
     shared=("turns", "lips", "wall", "marks"),
-    mark=mark_hole,
+    mark=n.mark_hole,
   )
   targets = 2
 
@@ -250,9 +211,9 @@ class Stitch(Knot, Stitching):
 
   def place(self, physics: Physics) -> None:
     """Puts the needle into the right hand's jaws, its thread away from both."""
-    pos, mat = piercing(self.marks, -half_angle(self.marks) - _BEFORE)
+    pos, mat = n.piercing(self.marks, -n.half_angle(self.marks) - _BEFORE)
     pos = pos + _OVER + self.random.uniform(-_DRAWN, _DRAWN, 3)
-    angle, tilt = RIGHT
+    angle, tilt = n.RIGHT
     tip = self.take_up(physics, (pos, mat), angle, lean=0.1, along=0.08, side=-1.0, tilt=tilt)
     self.start0 = float(np.linalg.norm(tip - self.marks[0]))
     tail = _TAIL + self.random.uniform(-0.15, 0.15, 3)
@@ -262,7 +223,7 @@ class Stitch(Knot, Stitching):
     thread.lay(np.array([swage, swage + tail]))
     self.threads = {thread.name: thread.positions}
     left = physics.hands[1]
-    place, turn = park(left.trocar())
+    place, turn = n.park(left.trocar())
     place = place + self.random.uniform(-0.005, 0.005, 3)
     left.set_joints(wrist.inverse(left.trocar(), place, turn))
     self.placed, self.attached, self.pierced = False, 1.0, 0.0
@@ -272,7 +233,7 @@ class Stitch(Knot, Stitching):
 
   def still(self, hand: int) -> np.ndarray:
     """Returns what keeps the jaws closed on the needle, or open."""
-    return Stitching.still(self, hand)
+    return n.Stitching.still(self, hand)
 
   def show(self, physics: Physics) -> None:
     """Marks the holes that are left, the next one in yellow."""
@@ -300,32 +261,32 @@ class Stitch(Knot, Stitching):
     """The right hand drives the needle, the left one draws it through; both tie."""
     assert p.other
     tie, left = Tie(self, p), p.other
-    yield from one(p, p, self._drive(p))
-    yield from one(p, left, take(left, *LEFT))
-    yield from one(p, p, let_go(p))
-    yield from one(p, left, self._draw(left))
+    yield from n.one(p, p, self._drive(p))
+    yield from n.one(p, left, n.take(left, *n.LEFT))
+    yield from n.one(p, p, n.let_go(p))
+    yield from n.one(p, left, self._draw(left))
     yield from tie.catch(1, round(BEYOND / drain.EDGE))
-    yield from one(p, left, self._pull_off(left))
+    yield from n.one(p, left, self._pull_off(left))
     yield from tie.wind(1, self.turns[0])
     yield from tie.draw(1)
     yield from tie.tighten(1)
 
   def _drive(self, p: Performer) -> Script:
     """Puts the needle over the first mark, and turns it about its circle through both."""
-    yield from approach(p, self.marks, _NEAR)
-    while self.holes < 2 or tip_angle(p.physics, self.marks) < OUT - 0.02:
-      end = max(OUT, tip_angle(p.physics, self.marks) + 0.2)
-      yield from turn_on(p, self.marks, end, _LOOK)
+    yield from n.approach(p, self.marks, _NEAR)
+    while self.holes < 2 or n.tip_angle(p.physics, self.marks) < n.OUT - 0.02:
+      end = max(n.OUT, n.tip_angle(p.physics, self.marks) + 0.2)
+      yield from n.turn_on(p, self.marks, end, _LOOK)
 
   def _draw(self, p: Performer) -> Script:
     """Turns the needle out of the tube, and draws it up to where its thread is to end."""
-    end = half_angle(self.marks) + _THROUGH
-    while tip_angle(p.physics, self.marks) < end - 0.05:
-      yield from turn_on(p, self.marks, end)
-    mat = piercing(self.marks, end)[1]
-    pose = self.line()[0] + RADIUS * mat[:, 1], mat
-    yield from carry(p, lambda t: pose)
-    yield from arrive(p)
+    end = n.half_angle(self.marks) + _THROUGH
+    while n.tip_angle(p.physics, self.marks) < end - 0.05:
+      yield from n.turn_on(p, self.marks, end)
+    mat = n.piercing(self.marks, end)[1]
+    pose = self.line()[0] + n.RADIUS * mat[:, 1], mat
+    yield from n.carry(p, lambda t: pose)
+    yield from n.arrive(p)
 
   def _pull_off(self, p: Performer) -> Script:
     """Pulls the needle off the thread that the other hand holds, and lets go of it aside."""
@@ -335,5 +296,5 @@ class Stitch(Knot, Stitching):
       p.tip = p.tip + _TUG * p.dt * up
       yield p.step()
     yield from p.line(p.tip - np.array([_ASIDE, 0.0, 0.0]), _ASIDE)
-    yield from jaws(p, WIDE)
-    yield from jaws(p, HOLD)
+    yield from n.jaws(p, n.WIDE)
+    yield from n.jaws(p, HOLD)

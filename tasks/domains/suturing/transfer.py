@@ -35,34 +35,7 @@ from ...core.base import Physics
 from ...core.performer import Performer, Script
 from ...core.scenes import Scene
 from ...registry import exercise
-from .needles import (
-  LOST,
-  MEETS,
-  NARROW,
-  PIECES,
-  QUARTER,
-  RADIUS,
-  TURNED,
-  Needlework,
-  Pose,
-  Taking,
-  apart,
-  arc,
-  carry,
-  close_on,
-  come,
-  grasp,
-  grasped,
-  height,
-  in_jaws,
-  leave,
-  left_grasp,
-  lingers,
-  needle,
-  one,
-  over,
-  right_grasp,
-)
+from . import needles as n
 
 TAKEN = 25.0 / 180.0  # where it is to be taken, from its first end, as a share of it
 TUBE, SIDES = 0.0008, 12  # of a ring: radius of its wire [m], and straight pieces
@@ -82,7 +55,7 @@ _ENTERS, _HANDS, _TAKES = math.radians(20.0), math.radians(20.0), math.radians(6
 _BACK, _RISE = 0.014, 0.016  # out of a ring, and off the needle [m]
 
 
-class State(Taking):
+class State(n.Taking):
   """State of a world."""
 
   size: float  # of the rings: inner radius [m]
@@ -116,7 +89,7 @@ def back(o):
 
 def from_first(s, o, share):
   """Returns where a share of the needle from the end that goes first ends [m]."""
-  return arc(s, share if back(o) else 1.0 - share)
+  return n.arc(s, share if back(o) else 1.0 - share)
 
 
 def crossing(s, o):
@@ -124,20 +97,20 @@ def crossing(s, o):
   found = float(-1.0)
   middle, way = o.middles[now(o)], o.ways[now(o)]
   before = from_first(s, o, 0.0) - middle
-  for k in range(PIECES):
-    after = from_first(s, o, float(k + 1) / float(PIECES)) - middle
+  for k in range(n.PIECES):
+    after = from_first(s, o, float(k + 1) / float(n.PIECES)) - middle
     a, b = r.dot(before, way), r.dot(after, way)
     if a * b <= 0.0 and a != b:
       part = a / (a - b)
       if r.length(before + part * (after - before)) < o.size:
-        found = (float(k) + part) / float(PIECES)
+        found = (float(k) + part) / float(n.PIECES)
     before = after
   return found
 
 
 def advance(s, o):
   """Follows the needle: who holds it, what it scrapes on, and how far it is through the ring."""
-  o = grasped(s, o, right_grasp(s), left_grasp(s))
+  o = n.grasped(s, o, n.right_grasp(s), n.left_grasp(s))
   force = r.scraped(s)
   if force > 0.0:
     o.scraping = o.scraping + o.control_timestep
@@ -168,7 +141,7 @@ def advance(s, o):
   progress = (float(o.done) + part) / float(count)
   if o.done == count:
     return o, 1.0, r.SUCCESS
-  return o, progress, r.MISSED if o.loose > LOST else r.RUNNING
+  return o, progress, r.MISSED if o.loose > n.LOST else r.RUNNING
 
 
 def observe(s, o):
@@ -179,10 +152,10 @@ def observe(s, o):
   o.circle = r.needle_place(s, r.vector(0.0, 0.0, 1.0)) - r.needle_place(s, r.vector(0.0, 0.0, 0.0))
   o.way = -o.ways[now(o)] if back(o) else 1.0 * o.ways[now(o)]
   if back(o):
-    o.target = arc(s, TAKEN) - r.tip(s)
-    return in_jaws(s, o, 0, TAKEN, 0.01)
-  o.target = arc(s, 1.0 - TAKEN) - r.other_tip(s)
-  return in_jaws(s, o, 1, 1.0 - TAKEN, -0.01)
+    o.target = n.arc(s, TAKEN) - r.tip(s)
+    return n.in_jaws(s, o, 0, TAKEN, 0.01)
+  o.target = n.arc(s, 1.0 - TAKEN) - r.other_tip(s)
+  return n.in_jaws(s, o, 1, 1.0 - TAKEN, -0.01)
 
 
 def mark(s, o, k):
@@ -199,7 +172,7 @@ def mark(s, o, k):
 @exercise("needle/transfer_hard", 70, "hard", "bimanual",
           asks="Pass a needle through three rings of 8 mm, from hand to hand",
           scene=FIELD, rings=3, size=0.004, tilt=20.0, jitter=0.005)  # fmt: skip
-class Transfer(Needlework):
+class Transfer(n.Needlework):
   """Pass a needle through rings, from hand to hand."""
 
   mark_radius = 0.0015
@@ -234,7 +207,7 @@ class Transfer(Needlework):
     far = (self.size + TUBE) / math.cos(math.pi / SIDES)  # the pieces are outside of the circle
     corners = far * np.column_stack([0 * turn, np.sin(turn), -np.cos(turn)])
     foot = corners[0] - np.array([0.0, 0.0, 0.02])
-    look = {"contype": MEETS, "conaffinity": MEETS, "rgba": (0.2, 0.55, 0.6, 1.0)} | FIRM
+    look = {"contype": n.MEETS, "conaffinity": n.MEETS, "rgba": (0.2, 0.55, 0.6, 1.0)} | FIRM
     round_ = spec.add_mesh(name="ring", scale=[self.size + TUBE] * 3)
     round_.make_supertorus(_FINE, TUBE / (self.size + TUBE), 1.0, 1.0)
     for k in range(self.targets):
@@ -253,7 +226,7 @@ class Transfer(Needlework):
       objname="rings", intprm=[2, 3, 1],
     )  # fmt: skip
     self.meet(spec)
-    look = {"contype": MEETS, "conaffinity": MEETS}
+    look = {"contype": n.MEETS, "conaffinity": n.MEETS}
     palpate.add_needle(spec, mass=MASS, contact=look)
     return spec
 
@@ -302,14 +275,14 @@ class Transfer(Needlework):
       mine, others = self.right_holds > 0, self.left_holds > 0
       giver, taker = (others, mine) if back(self) else (mine, others)
       off = self.through - (0.5 - _HANDS / math.pi)
-      if taker and self.through and (giver or lingers(gives)):
-        yield from one(p, gives, _let_go(self, gives))
+      if taker and self.through and (giver or n.lingers(gives)):
+        yield from n.one(p, gives, _let_go(self, gives))
       elif giver and (off < -0.03 or (p.hasty and abs(off) > 0.02)):
-        yield from one(p, gives, self._drive(gives))
+        yield from n.one(p, gives, self._drive(gives))
       elif giver:
-        yield from one(p, takes, self._take(takes))
+        yield from n.one(p, takes, self._take(takes))
       elif taker and self.through:
-        yield from one(p, takes, self._pull(takes))
+        yield from n.one(p, takes, self._pull(takes))
       else:  # nobody holds it
         yield from Performer.wait(p, 0.1)  # a teacher too
 
@@ -319,37 +292,38 @@ class Transfer(Needlework):
     if not self.through and not _begun(p, self):
       place, mat = entrance(self, ring)
       if ring:  # out of the ring before
-        pos, turned = needle(p.physics)
+        pos, turned = n.needle(p.physics)
         off = pos - posed(self, ring - 1, 0.0)[0]
         left = _BACK + sign * float(off @ self.ways[ring - 1])
         if left > 0 and np.linalg.norm(off) < _APART / 2:
           out = pos - sign * left * self.ways[ring - 1]
-          yield from carry(p, lambda t: (out, turned))
+          yield from n.carry(p, lambda t: (out, turned))
       way = sign * self.ways[ring]
-      clear = place - min(height(p, needle(p.physics), (place, mat), -way), _BACK) * way
-      yield from come(
-        carry(p, lambda t: (clear, mat)), lambda: over(p, needle(p.physics), (place, mat), -way)
+      clear = place - min(n.height(p, n.needle(p.physics), (place, mat), -way), _BACK) * way
+      yield from n.come(
+        n.carry(p, lambda t: (clear, mat)),
+        lambda: n.over(p, n.needle(p.physics), (place, mat), -way),
       )
-      yield from come(carry(p, lambda t: (place, mat)), lambda: _begun(p, self))
-    start, end = turn_of(self, p.physics), -QUARTER - sign * _HANDS
-    yield from carry(p, lambda t: posed(self, ring, start + t * (end - start)), end - start)
+      yield from n.come(n.carry(p, lambda t: (place, mat)), lambda: _begun(p, self))
+    start, end = turn_of(self, p.physics), -n.QUARTER - sign * _HANDS
+    yield from n.carry(p, lambda t: posed(self, ring, start + t * (end - start)), end - start)
 
   def _take(self, p: Performer) -> Script:
     """Takes the needle from above, near the end that went first."""
     sign = -1.0 if back(self) else 1.0
-    pos, mat = needle(p.physics)
-    goal, turn = grasp(p.trocar, pos, mat, sign * _TAKES)
+    pos, mat = n.needle(p.physics)
+    goal, turn = n.grasp(p.trocar, pos, mat, sign * _TAKES)
     up = mat[:, 2]
-    yield from close_on(p, (goal, turn), _RISE * up)
+    yield from n.close_on(p, (goal, turn), _RISE * up)
 
   def _pull(self, p: Performer) -> Script:
     """Turns the needle on until all of it is through, and out of the ring's way."""
     ring, sign = now(self), -1.0 if back(self) else 1.0
-    start, end = turn_of(self, p.physics), -QUARTER + sign * (QUARTER + _ENTERS)
-    yield from carry(p, lambda t: posed(self, ring, start + t * (end - start)), end - start)
+    start, end = turn_of(self, p.physics), -n.QUARTER + sign * (n.QUARTER + _ENTERS)
+    yield from n.carry(p, lambda t: posed(self, ring, start + t * (end - start)), end - start)
 
 
-def posed(task: Transfer, ring: int, turn: float) -> Pose:
+def posed(task: Transfer, ring: int, turn: float) -> n.Pose:
   """Returns the needle's pose in a ring, turned by an angle about its circle [rad].
 
   The circle lies level and goes through the ring's middle, at a polar angle of -90 degrees.
@@ -357,40 +331,41 @@ def posed(task: Transfer, ring: int, turn: float) -> Pose:
   way, up = task.ways[ring], np.array([0.0, 0.0, 1.0])
   side = np.cross(up, way)
   x = math.cos(turn) * way + math.sin(turn) * side
-  return task.middles[ring] + RADIUS * side, np.column_stack([x, np.cross(up, x), up])
+  return task.middles[ring] + n.RADIUS * side, np.column_stack([x, np.cross(up, x), up])
 
 
-def entrance(task: Transfer, ring: int) -> Pose:
+def entrance(task: Transfer, ring: int) -> n.Pose:
   """Returns the needle's pose in front of a ring, the end that goes first before it."""
   sign = -1.0 if ring % 2 else 1.0
-  return posed(task, ring, -QUARTER - sign * (QUARTER + _ENTERS))
+  return posed(task, ring, -n.QUARTER - sign * (n.QUARTER + _ENTERS))
 
 
 def turn_of(task: Transfer, physics: Any) -> float:
   """Returns how the needle is turned about its circle, see `posed`; from -270 to 90 degrees."""
   way = task.ways[now(task)]
-  x = needle(physics)[1][:, 0]
+  x = n.needle(physics)[1][:, 0]
   side = np.cross([0.0, 0.0, 1.0], way)
-  return math.remainder(math.atan2(x @ side, x @ way) + QUARTER, 2 * math.pi) - QUARTER
+  return math.remainder(math.atan2(x @ side, x @ way) + n.QUARTER, 2 * math.pi) - n.QUARTER
 
 
-def park(task: Transfer, port: Any, middle: np.ndarray) -> Pose:
+def park(task: Transfer, port: Any, middle: np.ndarray) -> n.Pose:
   """Returns a pose of a tip beside the rings, on the side of its trocar, jaws down."""
   aside = math.copysign(0.03, port.pos[0] - middle[0])
   turn = port.mat.copy()
-  return middle + np.array([aside, 0.0, 0.02]), turn @ trocar.about(2, -QUARTER)
+  return middle + np.array([aside, 0.0, 0.02]), turn @ trocar.about(2, -n.QUARTER)
 
 
 def _let_go(task: Transfer, p: Performer) -> Script:
   """Opens the jaws and takes the hand aside."""
   end = park(task, p.trocar, task.middles.mean(axis=0))
-  yield from leave(p, _RISE * p.turn[:, 2], end)
+  yield from n.leave(p, _RISE * p.turn[:, 2], end)
 
 
 def _begun(p: Performer, task: Transfer) -> bool:
   """Returns whether a teacher's needle may turn into the ring from where it is."""
-  (pos, mat), turn, sign = needle(p.physics), turn_of(task, p.physics), -1.0 if back(task) else 1.0
+  (pos, mat), turn = n.needle(p.physics), turn_of(task, p.physics)
+  sign = -1.0 if back(task) else 1.0
   place, turned = posed(task, now(task), turn)
-  way = sign * (turn + QUARTER) + QUARTER + _ENTERS
-  there = float(np.linalg.norm(pos - place)) < NARROW and apart(mat, turned) < TURNED
-  return p.hasty and there and -TURNED < way < 2 * _ENTERS
+  way = sign * (turn + n.QUARTER) + n.QUARTER + _ENTERS
+  there = float(np.linalg.norm(pos - place)) < n.NARROW and n.apart(mat, turned) < n.TURNED
+  return p.hasty and there and -n.TURNED < way < 2 * _ENTERS
