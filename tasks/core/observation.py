@@ -42,7 +42,8 @@ class Row:
     shape: of the array
     unit: of its numbers
     what: it is
-    measure: takes task and physics, or the other hand's instrument for a sensor, returns it
+    measure: takes task and physics, or the other hand's instrument for a sensor, returns it; None
+      for the method of the latter of its name
     only: what instruments have that have it: `jaws` or a `laparoscope`; empty for all
   """
 
@@ -50,103 +51,54 @@ class Row:
   shape: tuple[int, ...]
   unit: str
   what: str
-  measure: Callable[[Any, Physics], np.ndarray]
+  measure: Callable[[Any, Physics], np.ndarray] | None = None
   only: str = ""
 
 
 ROWS = {
   "joints": Row(
-    "sensors",
-    (4,),
-    "rad, m",
-    "pitch, yaw, roll, insertion; (6,) with `wrist_pitch` and `wrist_yaw` of one with a wrist",
-    lambda t, p: p.joints(),
-  ),
-  "joint_vel": Row("sensors", (4,), "rad/s, m/s", "their velocities", lambda t, p: p.joint_vel()),
+    "sensors", (4,), "rad, m",
+    "pitch, yaw, roll, insertion; (6,) with `wrist_pitch` and `wrist_yaw` of one with a wrist"),
+  "joint_vel": Row("sensors", (4,), "rad/s, m/s", "their velocities"),
   "drive": Row(
-    "sensors",
-    (4,),
-    "rad, m",
-    "target of the drives minus position: what the hand feels",
-    lambda t, p: p.drive_targets() - p.joints(),
-  ),
-  "tip_pos": Row("sensors", (3,), "m", "the tip, in the world", lambda t, p: p.tip_pos()),
-  "tip_quat": Row("sensors", (4,), "-", "its orientation, w x y z", lambda t, p: p.tip_quat()),
-  "tip_vel": Row("sensors", (3,), "m/s", "its velocity, in the world", lambda t, p: p.tip_vel()),
-  "contact_force": Row(
-    "sensors",
-    (3,),
-    "N",
-    "on the instrument below the shaft, in the world",
-    lambda t, p: p.contact_force(),
-  ),
-  "shaft_force": Row(
-    "sensors", (3,), "N", "on the shaft, in the world", lambda t, p: p.shaft_force()
-  ),
+    "sensors", (4,), "rad, m", "target of the drives minus position: what the hand feels",
+    lambda t, p: p.drive_targets() - p.joints()),
+  "tip_pos": Row("sensors", (3,), "m", "the tip, in the world"),
+  "tip_quat": Row("sensors", (4,), "-", "its orientation, w x y z"),
+  "tip_vel": Row("sensors", (3,), "m/s", "its velocity, in the world"),
+  "contact_force": Row("sensors", (3,), "N", "on the instrument below the shaft, in the world"),
+  "shaft_force": Row("sensors", (3,), "N", "on the shaft, in the world"),
   "peak_force": Row(
-    "sensors",
-    (1,),
-    "N",
+    "sensors", (1,), "N",
     "largest force since the last observation, or a jaw's mean if that is more",
-    lambda t, p: np.array([p.peak_force]),
-  ),
+    lambda t, p: np.array([p.peak_force])),
   "gripper": Row(
-    "sensors",
-    (4,),
-    "rad, rad, N, N",
-    "opening of the jaws, its target, force on the left and right jaw",
-    lambda t, p: p.gripper(),
-    only="jaws",
-  ),
+    "sensors", (4,), "rad, rad, N, N",
+    "opening of the jaws, its target, force on the left and right jaw", only="jaws"),
   "camera_head": Row(
-    "sensors",
-    (1,),
-    "rad",
-    "how far the camera is turned against the laparoscope",
-    lambda t, p: p.head(),
-    only="laparoscope",
-  ),
+    "sensors", (1,), "rad", "how far the camera is turned against the laparoscope",
+    lambda t, p: p.head(), "laparoscope"),
   "nodes_near": Row(
-    "state",
-    (NEAR, 3),
-    "m",
-    f"the {NEAR} nodes of the organ nearest to the tip, from the tip, nearest first",
-    lambda t, p: p.nodes_near(),
-  ),
+    "state", (NEAR, 3), "m",
+    f"the {NEAR} nodes of the organ nearest to the tip, from the tip, nearest first"),
   "surface": Row(
-    "state",
-    (COARSE, 3),
-    "m",
-    f"displacement from rest of {COARSE} nodes spread over the organ",
-    lambda t, p: p.surface(),
-  ),
+    "state", (COARSE, 3), "m", f"displacement from rest of {COARSE} nodes spread over the organ"),
   "progress": Row("state", (1,), "-", "of the task", lambda t, p: np.array([t.progress])),
   "camera_matrix": Row(
-    TRUTH,
-    (3, 3),
-    "pixels",
+    TRUTH, (3, 3), "pixels",
     "of the pictures' pinhole, as OpenCV has it; 0 is the middle of the first pixel",
-    lambda t, p: camera_matrix(t, p),
-  ),
+    lambda t, p: camera_matrix(t, p)),
   "camera_distortion": Row(
-    TRUTH, (2,), "-", "k1, k2 of the lens", lambda t, p: lens.lens(t.drawn)["bend"]
-  ),
+    TRUTH, (2,), "-", "k1, k2 of the lens", lambda t, p: lens.lens(t.drawn)["bend"]),
   "camera_pose": Row(
-    TRUTH,
-    (4, 4),
-    "-, m",
-    "from the world to the camera's frame, x right, y down, z forward",
-    lambda t, p: camera_pose(p),
-  ),
+    TRUTH, (4, 4), "-, m", "from the world to the camera's frame, x right, y down, z forward",
+    lambda t, p: camera_pose(p)),
   "keypoints": Row(
-    TRUTH,
-    (4, 3),
-    "pixels, -",
+    TRUTH, (4, 3), "pixels, -",
     "right, down, and 1 where the picture has it and the organ does not hide it: the tip, the tips "
     "of the left and right jaw, the shaft in the trocar; then the same of the other hand's",
-    lambda t, p: keypoints(t, p),
-  ),
-}
+    lambda t, p: keypoints(t, p)),
+}  # fmt: skip
 
 
 def camera_matrix(task: Any, physics: Physics) -> np.ndarray:
@@ -416,12 +368,12 @@ def _numbers(task: Any, physics: Physics) -> collections.OrderedDict:
   return out
 
 
-def _rows(first: str, second: str) -> list[tuple[str, Row, int]]:
+def _rows(first: str, second: str) -> list[tuple[str, str, int]]:
   """Returns names, rows and hands of instruments with these prefixes; the second's is sensors."""
-  out = [(name, row, 0) for name, row in ROWS.items() if _has(first, row.only)]
+  out = [(name, name, 0) for name, row in ROWS.items() if _has(first, row.only)]
   for name, row in ROWS.items() if second else ():
     if row.group == "sensors" and _has(second, row.only):
-      out.append((f"{second.rstrip('/')}_{name}", row, 1))
+      out.append((f"{second.rstrip('/')}_{name}", name, 1))
   return out
 
 
@@ -430,11 +382,20 @@ def _has(prefix: str, only: str) -> bool:
   return not only or only == trocar.kind(prefix) or (only == "jaws" and jawed(prefix))
 
 
+def _asking(name: str) -> Callable[[Any, Physics], np.ndarray]:
+  """Returns what asks physics, or the other hand's instrument, by its method of a name."""
+  return lambda task, physics: getattr(physics, name)()
+
+
 @functools.lru_cache
 def _plan(choice: Choice, first: str, second: str) -> tuple[list, Any]:
   """Returns names, measures, hands of the chosen rows, and the domain's own names or "all"."""
   known = _rows(first, second)
-  rows = [(name, row.measure, k) for name, row, k in known if choice.has(name, row.group)]
+  rows = [
+    (name, ROWS[of].measure or _asking(of), k)
+    for name, of, k in known
+    if choice.has(name, ROWS[of].group)
+  ]
   own = set(choice.names) - {name for name, *_ in known} - set(PICTURES) - {"sensors", TRUTH}
   return rows, "all" if "state" in own else own
 

@@ -19,18 +19,22 @@ SUCCESS = "success"  # how an exercise ends that was done
 ERRORS = ("miss", "drop", "unintended_contact")
 
 
-def _last(function: Callable[..., Any]) -> Callable[..., float]:
-  """Lets a metric be the last number of its column, (nstep,): of what is told of an episode so far.
+def _last(*about: Any, **named: Any) -> Callable[[Callable[..., Any]], Callable[..., float]]:
+  """Registers a metric that is the last number of its column, (nstep,): of an episode so far.
 
-  The column is that of the function's argument; the function has no body.
+  The column is that of the function's argument; the function has no body. Arguments as of `metric`.
   """
-  (column,) = inspect.signature(function).parameters
 
-  @functools.wraps(function)
-  def last(*values: Any, **named: Any) -> float:
-    return float(rows(column, *values, *named.values())[-1])
+  def register(function: Callable[..., Any]) -> Callable[..., float]:
+    (column,) = inspect.signature(function).parameters
 
-  return last
+    @functools.wraps(function)
+    def last(*values: Any, **given: Any) -> float:
+      return float(rows(column, *values, *given.values())[-1])
+
+    return metric(*about, **named)(last)
+
+  return register
 
 
 def count_events(kinds: Iterable[str], wanted: Iterable[str]) -> float:
@@ -92,8 +96,7 @@ def target_error(target_distance: ArrayLike) -> float:
   return float(touched.mean())
 
 
-@metric("Share freed", "-", "outcome", "all", "VTE: teasing (Kotamraju 2008)", better="neither")
-@_last
+@_last("Share freed", "-", "outcome", "all", "VTE: teasing (Kotamraju 2008)", better="neither")
 def share_freed(freed: ArrayLike):
   """Returns the share of the bonds' area that came free as it should [-], neither is better.
 
@@ -101,74 +104,62 @@ def share_freed(freed: ArrayLike):
   """
 
 
-@metric("Mean deviation", "m", "outcome", "all", "FLS: 2 mm, 10.1177/1553350607302329")
-@_last
+@_last("Mean deviation", "m", "outcome", "all", "FLS: 2 mm, 10.1177/1553350607302329")
 def cut_deviation(deviation: ArrayLike):
   """Returns the mean distance of a cut from its line [m], lower is better (FLS)."""
 
 
-@metric("Largest deviation", "m", "outcome", "max", "FLS: 2 mm, 10.1177/1553350607302329")
-@_last
+@_last("Largest deviation", "m", "outcome", "max", "FLS: 2 mm, 10.1177/1553350607302329")
 def cut_farthest(farthest: ArrayLike):
   """Returns the largest distance of a cut from its line [m], lower is better (FLS)."""
 
 
-@metric("Excess tissue", "m^2", "outcome", "all", "MISTELS: area of deviation")
-@_last
+@_last("Excess tissue", "m^2", "outcome", "all", "MISTELS: area of deviation")
 def cut_excess(excess: ArrayLike):
   """Returns the area between a cut and its line [m^2], lower is better (MISTELS)."""
 
 
-@metric("Jagged length", "m", "outcome", "all", "FLS: 2 mm, 10.1177/1553350607302329")
-@_last
+@_last("Jagged length", "m", "outcome", "all", "FLS: 2 mm, 10.1177/1553350607302329")
 def cut_jagged(jagged: ArrayLike):
   """Returns the length of a cut more than 2 mm from its line [m], lower is better (FLS)."""
 
 
-@metric("Depth of the blade", "m", "safety", "max", "this project: what lies under a wall")
-@_last
+@_last("Depth of the blade", "m", "safety", "max", "this project: what lies under a wall")
 def cut_depth(depth: ArrayLike):
   """Returns how far the blade's tip was under the wall that it cut [m], lower is better."""
 
 
-@metric("Time of current", "s", "safety", "all", "10.1007/s00464-013-3297-1: cautery time")
-@_last
+@_last("Time of current", "s", "safety", "all", "10.1007/s00464-013-3297-1: cautery time")
 def current_time(current: ArrayLike):
   """Returns how long a current was on [s], lower is better."""
 
 
-@metric("Current without a target", "s", "safety", "all", "as `current_time`")
-@_last
+@_last("Current without a target", "s", "safety", "all", "as `current_time`")
 def current_wasted(idle_current: ArrayLike):
   """Returns how long a current was on without touching what it is to free [s], lower is better."""
 
 
-@metric("Grasps of the needle", "count", "efficiency", "all", "GEARS: 10.1016/j.juro.2011.09.032")
-@_last
+@_last("Grasps of the needle", "count", "efficiency", "all", "GEARS: 10.1016/j.juro.2011.09.032")
 def regrasps(regrasped: ArrayLike):
   """Returns how often a hand took the needle [count], lower is better."""
 
 
-@metric("Contact with rings", "s", "safety", "all", "this project; as `shaft_contact`")
-@_last
+@_last("Contact with rings", "s", "safety", "all", "this project; as `shaft_contact`")
 def ring_contact(ring_time: ArrayLike):
   """Returns how long needle or instruments touched the rings [s], lower is better."""
 
 
-@metric("Peak force on rings", "N", "safety", "all", "this project; as `peak_force`")
-@_last
+@_last("Peak force on rings", "N", "safety", "all", "this project; as `peak_force`")
 def peak_ring_force(ring_force: ArrayLike):
   """Returns the largest force on the rings [N], lower is better."""
 
 
-@metric("Depth of the bite", "m", "outcome", "all", "FLS task 4: bites", better="neither")
-@_last
+@_last("Depth of the bite", "m", "outcome", "all", "FLS task 4: bites", better="neither")
 def bite_depth(bite: ArrayLike):
   """Returns how deep a needle went under a wall [m], neither is better."""
 
 
-@metric("Gap of the cut", "m", "outcome", "all", "FLS tasks 4 and 5: at most 1 mm")
-@_last
+@_last("Gap of the cut", "m", "outcome", "all", "FLS tasks 4 and 5: at most 1 mm")
 def final_gap(gap: ArrayLike):
   """Returns how far the cut gapes at its widest in the end [m], lower is better."""
 
@@ -183,14 +174,12 @@ def peak_tension(tension: ArrayLike) -> float:
   return float(rows("tension", tension).max())
 
 
-@metric("Tearing of holes", "m", "safety", "all", "FLS tasks 4 and 5: no avulsion")
-@_last
+@_last("Tearing of holes", "m", "safety", "all", "FLS tasks 4 and 5: no avulsion")
 def tearing(torn: ArrayLike):
   """Returns how far a hole of needle or thread has torn through tissue [m], lower is better."""
 
 
-@metric("Knot security", "N", "outcome", "all", "FLS tasks 4 and 5: security", better="neither")
-@_last
+@_last("Knot security", "N", "outcome", "all", "FLS tasks 4 and 5: security", better="neither")
 def knot_security(security: ArrayLike):
   """Returns the pull on a slit that its knot has held [N], neither is better."""
 
