@@ -107,7 +107,8 @@ class Thread(thread.Thread):
       for name, span in spans.items()
       if span.stop > span.start
     }
-    self._broken = own["broken"]
+    widest = max(array.shape[1] for array in own.values())
+    self._none = wp.zeros((1, widest), dtype=wp.float64, device=device)
     self.ties = Ties(nworld, device)
     if organ.config.refine:
       self.ties.track(n)
@@ -194,7 +195,7 @@ class Thread(thread.Thread):
   @property
   def broken(self) -> wp.array:
     """1 where an edge has broken, of float64 (nworld, nnode); the last one is of no edge."""
-    return self._broken
+    return self.own["broken"]
 
   def lay(self, places: np.ndarray, mask=None):
     """Puts the nodes of worlds at places, at rest; twist, breaks and kept bends are lost."""
@@ -208,8 +209,7 @@ class Thread(thread.Thread):
     batch._fresh = False
     wp.launch(kernels.lay, dim=local.shape, inputs=[laid], device=batch.device)
     for array in self.own.values():
-      zero = wp.zeros((1, array.shape[1]), dtype=wp.float64, device=batch.device)
-      inputs = [laid.mask, zero, array]
+      inputs = [laid.mask, self._none, array]
       wp.launch(kernels.put_back_rows, dim=array.shape, inputs=inputs, device=batch.device)
 
   @functools.cached_property

@@ -13,7 +13,6 @@ import warp as wp
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import rod
-from palpate.tissue.config import Config
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, Views, doubles, fill, ints, struct, zeros
 
@@ -165,36 +164,18 @@ begin, end = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Declaration:
-  """What is the same in every mjData of a model.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Declaration(declare.Vertices):
+  """A thread that a model declares.
 
   Attributes:
-    name: name of the flexcomp
-    flex: index of the flex
-    config: configuration
     radius: of the thread [m]
     rest: rest positions in the slides' axes [m]  (nvert, 3)
-    free: whether a vertex moves                  (nvert,) bool
-    body: body of each vertex                     (nvert,)
-    dofadr: first dof, -1 if pinned               (nvert,)
-    qposadr: first qpos, -1 if pinned             (nvert,)
-    frame: rotation from the slides' axes to the world (3, 3)
-    origin: position of the parent body [m]       (3,)
     most_vertices: vertices of organs that there is room for in its step
   """
 
-  name: str
-  flex: int
-  config: Config
   radius: float
   rest: np.ndarray
-  free: np.ndarray
-  body: np.ndarray
-  dofadr: np.ndarray
-  qposadr: np.ndarray
-  frame: np.ndarray
-  origin: np.ndarray
   most_vertices: int
 
   @functools.cached_property
@@ -205,16 +186,6 @@ class Declaration:
   def sizes(self, nv: int) -> dict[str, int]:
     """Returns the sizes of its `RodState` among nv dofs."""
     return layout.rod_sizes(len(self.rest), nv, self.config.refine, self.config.yield_strain)
-
-  @property
-  def dofs(self) -> np.ndarray:
-    """Degrees of freedom of the moving vertices."""
-    return (self.dofadr[self.free, None] + np.arange(3)).ravel()
-
-  @property
-  def qposs(self) -> np.ndarray:
-    """Where they are in qpos."""
-    return (self.qposadr[self.free, None] + np.arange(3)).ravel()
 
   @property
   def length(self) -> np.ndarray:
@@ -259,8 +230,9 @@ def read(m: mjstruct.Struct, instance: int) -> Declaration:
   meets = (kind[flex] & aims | kind & aims[flex]) * (dim > 1)
   most = _MOST_VERTICES if meets.any() else 0
   return Declaration(
-    name, flex, config, radius, rest, free, body, dofadr, qposadr, frame, origin, most
-  )
+    name=name, flex=flex, config=config, radius=radius, rest=rest, free=free, body=body,
+    dofadr=dofadr, qposadr=qposadr, frame=frame, origin=origin, most_vertices=most,
+  )  # fmt: skip
 
 
 def settings(organ: Declaration, friction: float) -> dict:

@@ -36,43 +36,69 @@ _CACHED = 16
 _made: dict[bytes, Declaration] = {}
 
 
-@dataclasses.dataclass(frozen=True)
-class Declaration:
-  """What is the same in every mjData of a model.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Vertices:
+  """What a flexcomp of an organ or a thread declares, the same in every mjData of a model.
 
   Attributes:
     name: name of the flexcomp
     flex: index of the flex
-    mesh: topology and rest shape, in the frame of the parent body
     config: configuration
-    still: shape and tissue on the device, with no world
     free: whether a vertex moves            (nvert,) bool
     body: body of each vertex               (nvert,)
     dofadr: first dof, -1 if pinned         (nvert,)
     qposadr: first qpos, -1 if pinned       (nvert,)
-    stateadr: first own number in the plugin state, -1 if pinned (nvert,)
-    nfree: three times the number of vertices that have dofs
     frame: rotation from the slides' axes to the world (3, 3)
     origin: position of the parent body [m] (3,)
-    mass: mass of each vertex [kg]          (nvert,)
     windows: the windows, or None where the vertices are MuJoCo's dofs
   """
 
   name: str
   flex: int
-  mesh: Mesh
   config: Config
-  still: Body
   free: np.ndarray
   body: np.ndarray
   dofadr: np.ndarray
   qposadr: np.ndarray
-  stateadr: np.ndarray
-  nfree: int
   frame: np.ndarray
   origin: np.ndarray
-  mass: np.ndarray
   windows: Windows | None = None
+
+  @property
+  def jointed(self) -> np.ndarray:
+    """Vertices that are dofs of MuJoCo."""
+    return np.flatnonzero(self.dofadr >= 0)
+
+  @property
+  def dofs(self) -> np.ndarray:
+    """Degrees of freedom of the moving vertices, or of the windows' slots."""
+    first = self.windows.dofadr if self.windows else self.dofadr[self.jointed]
+    return (first[:, None] + np.arange(3)).ravel()
+
+  @property
+  def qposs(self) -> np.ndarray:
+    """Where they are in qpos."""
+    first = self.windows.qposadr if self.windows else self.qposadr[self.jointed]
+    return (first[:, None] + np.arange(3)).ravel()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Declaration(Vertices):
+  """An organ that a model declares.
+
+  Attributes:
+    mesh: topology and rest shape, in the frame of the parent body
+    still: shape and tissue on the device, with no world
+    stateadr: first own number in the plugin state, -1 if pinned (nvert,)
+    nfree: three times the number of vertices that have dofs
+    mass: mass of each vertex [kg]          (nvert,)
+  """
+
+  mesh: Mesh
+  still: Body
+  stateadr: np.ndarray
+  nfree: int
+  mass: np.ndarray
 
   @functools.cached_property
   def signature(self) -> float:
@@ -101,26 +127,9 @@ class Declaration:
     return [self.windows.flex if self.windows else self.flex]
 
   @property
-  def jointed(self) -> np.ndarray:
-    """Vertices that are dofs of MuJoCo."""
-    return np.flatnonzero(self.dofadr >= 0)
-
-  @property
   def inner(self) -> np.ndarray:
     """Vertices inside of a solid."""
     return np.arange(self.mesh.nskin if len(self.mesh.tet) else self.mesh.nvert, self.mesh.nvert)
-
-  @property
-  def dofs(self) -> np.ndarray:
-    """Degrees of freedom of the moving vertices, or of the windows' slots."""
-    first = self.windows.dofadr if self.windows else self.dofadr[self.jointed]
-    return (first[:, None] + np.arange(3)).ravel()
-
-  @property
-  def qposs(self) -> np.ndarray:
-    """Where they are in qpos."""
-    first = self.windows.qposadr if self.windows else self.qposadr[self.jointed]
-    return (first[:, None] + np.arange(3)).ravel()
 
 
 @dataclasses.dataclass(frozen=True)
