@@ -42,6 +42,15 @@ def check_counts(args: argparse.Namespace, *names: str):
       raise CommandError(f"{name} is {getattr(args, name)}, expected a whole number >= 1")
 
 
+@contextlib.contextmanager
+def one_line(*kinds: type[Exception], before: str = "") -> Iterator[None]:
+  """Turns a ValueError, or an error of other kinds, into one line, with words before it."""
+  try:
+    yield
+  except (ValueError, *kinds) as error:
+    raise CommandError(f"{before}{error}") from None
+
+
 class Interrupt:
   """Makes Ctrl-C a flag while the block runs; a second Ctrl-C raises KeyboardInterrupt.
 
@@ -148,6 +157,14 @@ def writing(path: pathlib.Path, before: str = "") -> Iterator[None]:
   except OSError as error:
     why = error.strerror or str(error)
     raise CommandError(f"{before}cannot write {str(path)!r}: {why}", code=1) from None
+
+
+def write(path: pathlib.Path, text: str):
+  """Writes a file, whole or not at all; CommandError where it cannot be written."""
+  from palpate.tasks.files import replacing
+
+  with writing(path), replacing(path) as file:
+    file.write(text)
 
 
 @contextlib.contextmanager

@@ -11,8 +11,8 @@ from typing import Any
 
 import palpate
 
-from . import options
-from .console import CommandError, Interrupt, Progress, output, output_folder, writing
+from . import console, options
+from .console import CommandError
 from .draw import film
 from .trainee import keeping
 
@@ -60,19 +60,17 @@ def main(args: argparse.Namespace) -> int:
   if args.device:
     from .live.devices import registry
 
-    try:
+    with console.one_line():
       if registry.on_page(args.device):
         return _page(args)
       if args.left and registry.on_page(args.left):
         raise ValueError(f"left is {args.left!r}, which is on a page as --device alone")
-    except ValueError as error:
-      raise CommandError(str(error)) from None
   job = _prepare(args)
-  progress, failure, views = Progress(), None, _views(args, job)
+  progress, failure, views = console.Progress(), None, _views(args, job)
   camera = contextlib.nullcontext(views)
   if job.film:
     camera = film.laparoscope(job.film, job.size)
-  with Interrupt() as interrupt, camera as shoot:
+  with console.Interrupt() as interrupt, camera as shoot:
 
     def watch(env) -> bool:
       progress.show(f"{job.name} {env.physics.time():.1f} s, {100 * env.task.best:.0f} % done")
@@ -190,7 +188,7 @@ def _prepare(args: argparse.Namespace) -> _Job:
   """Returns the job, everything that can be wrong with it checked."""
   old, sitting, path = None, None, None
   references = keeping.references(args.references)
-  try:
+  with console.one_line(OSError):
     if args.replay:
       if args.trainee is not None:
         raise CommandError("trainee is given with --replay, which is no attempt")
@@ -202,15 +200,13 @@ def _prepare(args: argparse.Namespace) -> _Job:
         sitting = kept.begin()
         path, info = sitting.reserve(name)
       run = _perform(args, name, info, path)
-  except (ValueError, OSError) as error:
-    raise CommandError(str(error)) from None
   folder = None
   if args.out or not sitting:
     default = f"out/{name.replace('/', '_')}{'_replay' if old else ''}"
-    folder = output_folder("out", pathlib.Path(args.out or default))
+    folder = console.output_folder("out", pathlib.Path(args.out or default))
   if old and folder and (folder / "recording.npz").resolve() == pathlib.Path(args.replay).resolve():
     raise CommandError(f"out is {str(folder)!r}, the folder of the recording that is replayed")
-  shot = output("film", args.film, film.FILMS) if args.film else None
+  shot = console.output("film", args.film, film.FILMS) if args.film else None
   if shot:
     film.check(shot.suffix)
   size = film.size(args.size)
@@ -297,7 +293,7 @@ def _write_files(
   from palpate.tasks.files import replacing
   from palpate.tasks.people.report import write_report
 
-  with writing(folder):
+  with console.writing(folder):
     print(f"recording  {recording.save(folder / 'recording.npz')}")
     with replacing(folder / "metrics.json") as file:
       file.write(recording.metrics().to_json(1) + "\n")

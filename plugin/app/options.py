@@ -6,7 +6,7 @@ import inspect
 import json
 from typing import Any
 
-from .console import CommandError
+from .console import CommandError, one_line
 
 
 def add_argument(parser: argparse.ArgumentParser):
@@ -52,10 +52,8 @@ def task_name(text: str) -> str:
   """Returns the whole name of a task, such as `touch/standard` of `touch`."""
   from palpate.tasks import suite
 
-  try:
+  with one_line():
     return "/".join(suite.split(text))
-  except ValueError as error:
-    raise CommandError(str(error)) from None
 
 
 def load(name: str, task_kwargs: dict[str, Any]):

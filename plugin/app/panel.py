@@ -16,8 +16,8 @@ from typing import Any
 
 import palpate
 
-from . import workers
-from .console import CommandError, Interrupt, Progress, check_counts, output_folder, writing
+from . import console, workers
+from .console import CommandError
 from .learn.evaluate import Result, perform
 
 _SEED = 10_000  # far from the seeds that people and tests use: those stay fresh
@@ -39,23 +39,21 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  check_counts(args, "episodes")
+  console.check_counts(args, "episodes")
   crew = workers.chosen(args)
   palpate.register()
   from palpate.tasks import suite
   from palpate.tasks.core import performer
 
-  try:
+  with console.one_line():
     pairs = [suite.split(task) for task in args.tasks] or suite.ALL_TASKS
     performer.find(args.performer)
-  except ValueError as error:
-    raise CommandError(str(error)) from None
-  out = output_folder("out", args.out)
-  runs = output_folder("runs", pathlib.Path(args.runs).absolute() / fingerprint())
+  out = console.output_folder("out", args.out)
+  runs = console.output_folder("runs", pathlib.Path(args.runs).absolute() / fingerprint())
   seeds = range(args.seed, args.seed + args.episodes)
   jobs = [("/".join(pair), args.performer, seed, str(runs)) for pair in pairs for seed in seeds]
-  progress, results = Progress(), []
-  with Interrupt() as interrupt:
+  progress, results = console.Progress(), []
+  with console.Interrupt() as interrupt:
     for job, result in zip(jobs, workers.parallel(kept, jobs, crew, interrupt), strict=False):
       if result is None:
         raise CommandError("a process died; go on with the same command", code=1)
@@ -105,7 +103,6 @@ def _write(out: pathlib.Path, task: str, args: argparse.Namespace, results: list
   """Writes the reference of a task's successes and says how many there were."""
   import mujoco
   from palpate.tasks import suite
-  from palpate.tasks.files import replacing
   from palpate.tasks.metrics import SUCCESS, Metrics
   from palpate.tasks.people.score import make_reference, to_json
 
@@ -118,6 +115,5 @@ def _write(out: pathlib.Path, task: str, args: argparse.Namespace, results: list
   data |= {"performer": args.performer, "episodes": len(results)}
   data |= {"palpate": palpate.__version__, "mujoco": mujoco.__version__}
   path = out / f"{task.replace('/', '_')}.json"
-  with writing(path), replacing(path) as file:
-    file.write(to_json(data))
+  console.write(path, to_json(data))
   print(f"{path}  {said}")

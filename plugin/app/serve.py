@@ -7,7 +7,8 @@ import webbrowser
 
 from palpate import register
 
-from .console import CommandError, Interrupt, check_counts, need, output_folder
+from . import console
+from .console import CommandError
 from .trainee import keeping
 
 _LOOK = 0.2  # between looks at whether Ctrl-C was pressed [s]
@@ -41,13 +42,11 @@ def main(args: argparse.Namespace) -> int:
   register()
   from .live.devices import registry
 
-  try:
+  with console.one_line():
     registry.check(args.device)
-  except ValueError as error:
-    raise CommandError(str(error)) from None
   if not 0 <= args.port < 65536:
     raise CommandError(f"port is {args.port}, expected a whole number in [0, 65535]")
-  check_counts(args, "pages")
+  console.check_counts(args, "pages")
   return run(
     pathlib.Path(args.out), args.host, args.port, args.token, args.device, args.pages, args.open,
     kept=keeping.read(args, pages=True), scene=_scene(args.scene),
@@ -62,10 +61,8 @@ def _scene(path: str | None) -> str:
 
   if not pathlib.Path(path).is_file():
     raise CommandError(f"scene is {path!r}, expected an MJCF file")
-  try:
+  with console.one_line():
     own(pathlib.Path(path), ())
-  except ValueError as error:
-    raise CommandError(str(error)) from None
   return str(pathlib.Path(path).resolve())
 
 
@@ -95,17 +92,17 @@ def run(
     kept: the record that recordings go to, None for the folder
     scene: MJCF file for free practice, empty for none
   """
-  need("live", "websockets")
+  console.need("live", "websockets")
   from .live.page.server import Server
 
-  folder = output_folder("out", folder)
+  folder = console.output_folder("out", folder)
   try:
     server = Server(folder, host, port, token, device, pages, kept, scene)
   except OSError as error:
     raise CommandError(f"cannot listen on {host}:{port}: {error}", code=1) from None
   url = f"{server.url}#task={task}" if task else server.url
   thread = threading.Thread(target=server.run, daemon=True)
-  with Interrupt() as interrupt:
+  with console.Interrupt() as interrupt:
     thread.start()
     place = kept if kept and kept.folder else folder
     print(f"page       {url}\nrecordings {place}\nCtrl-C ends", flush=True)

@@ -309,7 +309,7 @@ def test_a_full_disk_is_named_and_nothing_is_lost(tmp_path, monkeypatch, capsys)
 )
 def test_what_is_wrong_is_said_before_the_work(words, said, capsys, monkeypatch, tmp_path):
   monkeypatch.setattr(command, "keep", lambda job: pytest.fail("it worked first"))
-  monkeypatch.setattr(command, "need", lambda *names: None)
+  monkeypatch.setattr(command.console, "need", lambda *names: None)
   assert export(*words, "-o", "out") == 2
   message = capsys.readouterr().err
   assert said in message and message.count("\n") == 1

@@ -9,7 +9,8 @@ import sys
 import numpy as np
 from palpate import register
 
-from ..console import CommandError, Interrupt, Progress, need, output_folder, table, writing
+from .. import console
+from ..console import CommandError
 
 _LEVEL = 0.95
 _SI = "all numbers of the command line are in SI units"
@@ -48,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
 
   _check(args)
   record = measured.read(pathlib.Path(args.data))
-  out = output_folder("out", args.out)
+  out = console.output_folder("out", args.out)
   register()
   from palpate.tissue.config import Config
 
@@ -56,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
 
   test = _test(args)
   known = _known(args)
-  progress = Progress()
+  progress = console.Progress()
   progress.show("filling the tissue; the first run takes some seconds longer", always=True)
   simulation = indentation.Indentation(test, record)
   starts = {"poisson": Config.poisson, "damping": Config.damping}
@@ -67,7 +68,7 @@ def main(args: argparse.Namespace) -> int:
   free = [least_squares.constant(name, starts.get(name)) for name in dict.fromkeys(args.free)]
   start = starts | {each.name: each.start for each in free}
 
-  with Interrupt() as interrupt:
+  with console.Interrupt() as interrupt:
 
     def simulate(values):
       return simulation.force(start | values, interrupt)
@@ -80,7 +81,7 @@ def main(args: argparse.Namespace) -> int:
   progress.clear()
   constants = start | found.values
   _write(out, args, simulation, record, free, found, constants)
-  print(table(_rows(free, found, record, simulation)))
+  print(console.table(_rows(free, found, record, simulation)))
   for name, value in found.kept.items():
     print(
       f"palpate: the data do not determine {name}: it is kept at {value:g}, for which the other "
@@ -123,10 +124,8 @@ def _test(args: argparse.Namespace):
 
   name, _, place = (args.organ or "").partition(":")
   if args.organ is not None:
-    try:
+    with console.one_line():
       places = scene.targets(name)
-    except ValueError as error:
-      raise CommandError(str(error)) from None
     place = place or catalog.entry(name).ports[0].landmark
     if place not in places:
       raise CommandError(f"organ {name!r}: place is {place!r}, expected one of {', '.join(places)}")
@@ -175,7 +174,6 @@ def _rows(free, found, record, simulation) -> list[tuple[str, str]]:
 def _write(out: pathlib.Path, args, simulation, record, free, found, constants):
   """Writes fit.json and fit.xml."""
   from palpate.models import mjcf
-  from palpate.tasks.files import replacing
 
   unit = {each.name: each.unit for each in free}
   numbers = {
@@ -205,13 +203,9 @@ def _write(out: pathlib.Path, args, simulation, record, free, found, constants):
     "complete": found.whole,
     "undetermined": list(found.kept),
   }
-  path = out / "fit.json"
-  with writing(path), replacing(path) as file:
-    file.write(json.dumps(about, indent=2) + "\n")
-  path = out / "fit.xml"
+  console.write(out / "fit.json", json.dumps(about, indent=2) + "\n")
   text = mjcf.plugin(simulation.keys | {key: float(f"{v:.5g}") for key, v in constants.items()})
-  with writing(path), replacing(path) as file:
-    file.write(text + "\n")
+  console.write(out / "fit.xml", text + "\n")
 
 
 def _or_none(value: float) -> float | None:
@@ -221,7 +215,7 @@ def _or_none(value: float) -> float | None:
 def _plot(path: pathlib.Path, record, found):
   """Draws measurement, fit and residual."""
   try:
-    need("plot", "matplotlib")
+    console.need("plot", "matplotlib")
   except CommandError as error:
     print(f"palpate: no plot: {error}", file=sys.stderr)
     return

@@ -16,16 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import palpate
 
-from .. import options, workers
-from ..console import (
-  CommandError,
-  Interrupt,
-  Progress,
-  check_counts,
-  output,
-  output_folder,
-  writing,
-)
+from .. import console, options, workers
+from ..console import CommandError
 from ..trainee import keeping
 
 if TYPE_CHECKING:
@@ -70,31 +62,27 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  check_counts(args, "episodes")
+  console.check_counts(args, "episodes")
   crew = workers.chosen(args)
   palpate.register()
   from palpate.tasks.core import performer
 
   known = keeping.references(args.references)
   name = options.task_name(args.task)
-  try:
+  with console.one_line():
     found = performer.find(args.policy)
     trained = performer.is_policy(found)
-  except ValueError as error:
-    raise CommandError(str(error)) from None
-  file = output("json", args.json) if args.json else None
+  file = console.output("json", args.json) if args.json else None
   if args.recordings:
-    output_folder("recordings", args.recordings)
+    console.output_folder("recordings", args.recordings)
   task_kwargs = _seen(found) | options.read(args.set, args.observations)
   if task_kwargs or trained:  # what is wrong with them is said once
     env = options.environment(name, json.dumps(task_kwargs))
-    try:
+    with console.one_line():
       _ = performer.make(env, args.policy) if trained else None
-    except ValueError as error:
-      raise CommandError(str(error)) from None
   seeds = range(args.seed, args.seed + args.episodes)
-  progress, results = Progress(), []
-  with Interrupt() as interrupt:
+  progress, results = console.Progress(), []
+  with console.Interrupt() as interrupt:
     for result in evaluate(name, args.policy, seeds, crew, args.recordings, interrupt, task_kwargs):
       results.append(result)
       progress.show(f"{len(results)} of {args.episodes}")
@@ -102,7 +90,8 @@ def main(args: argparse.Namespace) -> int:
   if results:
     print(table(name, args.policy, results, known(name)))
   if file is not None:
-    _write_json(file, results)
+    rows = [dataclasses.asdict(r) | {"metrics": json.loads(r.metrics or "null")} for r in results]
+    console.write(file, json.dumps(rows, indent=1) + "\n")
   if interrupt.seen:
     print(f"palpate: interrupted after {len(results)} of {args.episodes} episodes", file=sys.stderr)
     return 130
@@ -116,17 +105,6 @@ def _seen(found: Any) -> dict[str, Any]:
   """Returns the options of the pictures that a policy sees."""
   pixels = list(getattr(getattr(found, "about", None), "pixels", ()))
   return {"observations": ["sensors", "pixels"], "pixels": pixels} if pixels else {}
-
-
-def _write_json(path: pathlib.Path, results: list[Result]):
-  from palpate.tasks.files import replacing
-
-  rows = [
-    dataclasses.asdict(r) | {"metrics": json.loads(r.metrics) if r.metrics else None}
-    for r in results
-  ]
-  with writing(path), replacing(path) as file:
-    file.write(json.dumps(rows, indent=1) + "\n")
 
 
 def evaluate(

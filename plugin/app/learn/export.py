@@ -19,8 +19,8 @@ from typing import Any
 
 import palpate
 
-from .. import datasets, options, workers
-from ..console import CommandError, Interrupt, Progress, check_counts, need, output_folder, writing
+from .. import console, datasets, options, workers
+from ..console import CommandError
 from ..panel import fingerprint
 
 _JOB = "job.json"
@@ -107,11 +107,11 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  check_counts(args, "episodes")
+  console.check_counts(args, "episodes")
   if not 0 <= args.noise <= 1:
     raise CommandError(f"noise is {args.noise}, expected a number in [0, 1]")
   crew = workers.chosen(args)
-  need(*datasets.FORMATS[args.format])
+  console.need(*datasets.FORMATS[args.format])
   palpate.register()
   task, kwargs, todo = _todo(args)
   out = pathlib.Path(args.out)
@@ -160,7 +160,7 @@ def _todo(args: argparse.Namespace) -> tuple[str, dict[str, Any], list[tuple[str
   if args.renderer:
     chosen["renderer"] = args.renderer
   kwargs, found = options.read(args.set), []
-  try:
+  with console.one_line(OSError):
     if args.recordings:
       if args.task or args.set or args.noise:
         raise ValueError("recordings have a task, options and actions of their own, expected none")
@@ -173,8 +173,6 @@ def _todo(args: argparse.Namespace) -> tuple[str, dict[str, Any], list[tuple[str
     kwargs = kwargs | chosen if args.recordings else chosen | kwargs
     env = options.environment(task, json.dumps(kwargs))
     datasets.of(args.format).check(env)
-  except (ValueError, OSError) as error:
-    raise CommandError(str(error)) from None
   _check_drawing(env)
   return task, kwargs, [(path, own | chosen) for path, own in found]
 
@@ -242,8 +240,6 @@ def _jobs(
 
 def _begin(parts: pathlib.Path, args: argparse.Namespace, task: str, kwargs: dict[str, Any]):
   """Makes the folder of episodes, or checks that what is there is of this job."""
-  from palpate.tasks.files import replacing
-
   mine = {
     "task": task, "performer": _who(args)[0], "options": kwargs, "noise": args.noise,
     "sources": fingerprint(),
@@ -259,15 +255,14 @@ def _begin(parts: pathlib.Path, args: argparse.Namespace, task: str, kwargs: dic
     for left in parts.glob(".*.part"):  # by a process that was ended
       left.unlink()
     return
-  output_folder("out", parts)
-  with writing(path), replacing(path) as file:
-    json.dump(mine, file, indent=1)
+  console.output_folder("out", parts)
+  console.write(path, json.dumps(mine, indent=1))
 
 
 def _run(jobs: list[Job], crew: workers.Workers) -> tuple[list[Kept], bool]:
   """Runs the jobs; returns what came of them, and whether it was interrupted."""
-  progress, kept = Progress(), []
-  with Interrupt() as interrupt:
+  progress, kept = console.Progress(), []
+  with console.Interrupt() as interrupt:
     try:
       for job, done in zip(jobs, workers.parallel(keep, jobs, crew, interrupt), strict=False):
         kept.append(done or Kept(job.name, None, why="a process died in it"))
@@ -304,7 +299,7 @@ def keep(job: Job) -> Kept:
   if not len(demo):
     return Kept(job.name, None, why="it has no steps")
   steps, outcome = len(demo), demo.info["outcome"]
-  with writing(path):
+  with console.writing(path):
     demo.save(path)
   return Kept(job.name, outcome, steps)
 
@@ -322,7 +317,7 @@ def _assemble(
   if not good:
     raise CommandError(f"no episode succeeded, the first: {left[0]}; --failures takes them", code=1)
   folder = parts / "dataset"
-  with writing(out):
+  with console.writing(out):
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     try:

@@ -14,17 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import palpate
 
-from .. import options, workers
-from ..console import (
-  CommandError,
-  Interrupt,
-  Progress,
-  check_counts,
-  csv_rows,
-  need,
-  output_folder,
-  writing,
-)
+from .. import console, options, workers
+from ..console import CommandError
 from .teaching import LESSONS, LINES, School
 
 if TYPE_CHECKING:
@@ -84,15 +75,15 @@ def main(args: argparse.Namespace) -> int:
   for count in ("iterations", "lessons"):
     if getattr(args, count) < 0:
       raise CommandError(f"{count} is {getattr(args, count)}, expected a whole number >= 0")
-  check_counts(args, "updates", *(["num_envs"] if args.num_envs is not None else []))
+  console.check_counts(args, "updates", *(["num_envs"] if args.num_envs is not None else []))
   if not args.minutes > 0:
     raise CommandError(f"minutes is {args.minutes:g}, expected a number > 0")
   crew = workers.chosen(args)
-  need("train", "torch", "rsl_rl", "tensordict", "safetensors", "gymnasium")
+  console.need("train", "torch", "rsl_rl", "tensordict", "safetensors", "gymnasium")
   palpate.register()
 
-  training = Training(options.task_name(args.task), args, output_folder("out", args.out))
-  with Interrupt() as interrupt:
+  training = Training(options.task_name(args.task), args, console.output_folder("out", args.out))
+  with console.Interrupt() as interrupt:
     ok = training.teach(crew, interrupt) and training.practise(interrupt)
   print(training.folder / "policy.safetensors")
   if not ok:
@@ -152,12 +143,10 @@ class Training:
     path = own if (begun or self.school.rounds) and own.exists() else self.args.start
     if not path:
       return
-    try:
+    with console.one_line(before="from: "):
       made = policy.load(path)
       if not begun:
         self.networks.take(made)
-    except ValueError as error:
-      raise CommandError(f"from: {error}") from None
     before = made.about.training.get("from", "")
     self.networks.start = before if path == own else pathlib.Path(path).name
     if not begun:
@@ -175,13 +164,11 @@ class Training:
         f"{self.name}: observations is {','.join(names)}, expected sensors,{policy.PIXELS} or "
         "numbers alone"
       )
-    try:
+    with console.one_line(before="teacher: "):
       given = self.args.teacher
       return policy.shipped(self.name) if given == _TRAINED else policy.load(given)
-    except ValueError as error:
-      raise CommandError(f"teacher: {error}") from None
 
-  def teach(self, crew: workers.Workers, interrupt: Interrupt) -> bool:
+  def teach(self, crew: workers.Workers, interrupt: console.Interrupt) -> bool:
     """Lets the expert teach; returns whether it was to the end."""
     from palpate.tasks.learn import learning
 
@@ -204,7 +191,7 @@ class Training:
     from palpate.tasks.learn import policy
 
     school, networks = self.school, self.networks
-    with writing(self.folder):
+    with console.writing(self.folder):
       training = {
         "algorithm": "lessons", "lessons": networks.lessons, "rounds": school.rounds,
         "seconds": round(school.seconds, 1), "seed": self.args.seed,
@@ -213,13 +200,13 @@ class Training:
       policy.save(self.folder / policy.FILE, made)
       (self.folder / "LICENSE").write_text(_LICENCE, encoding="utf-8")
 
-  def practise(self, interrupt: Interrupt) -> bool:
+  def practise(self, interrupt: console.Interrupt) -> bool:
     """Practises in many worlds; returns whether it was to the end."""
     time_left = self.school.seconds < 60 * self.args.minutes
     learner = self._learner() if self.args.iterations and time_left else None
     if learner is None:
       return True
-    rows, progress = _kept(self.folder, learner.iteration), Progress(lines=LINES)
+    rows, progress = _kept(self.folder, learner.iteration), console.Progress(lines=LINES)
     last = learner.seconds
     while not interrupt.seen and not _enough(self.args, learner, rows, interrupt):
       row = learner.iterate(interrupt)
@@ -253,7 +240,7 @@ class Training:
       return None
     except (ValueError, TypeError) as error:
       raise CommandError(str(error)) from None
-    try:
+    with console.one_line():
       if self.teacher:
         limits = self.args.iterations, 60 * self.args.minutes
         learner = distillation.Distillation(
@@ -263,8 +250,6 @@ class Training:
         learner = learning.Learner(env, self.settings, self.networks, self.school.seconds)
       if path.exists():
         learner.load(path, self.name)
-    except ValueError as error:
-      raise CommandError(str(error)) from None
     return learner
 
   def _told(self) -> dict[str, Any]:
@@ -275,13 +260,13 @@ class Training:
     from palpate.tasks.learn import learning, policy
 
     folder = self.folder
-    with writing(folder):
+    with console.writing(folder):
       learner.save(folder / learning.CHECKPOINT, self.name)
       policy.save(folder / policy.FILE, learner.policy(self.task, self._told()))
       (folder / "LICENSE").write_text(_LICENCE, encoding="utf-8")
       if rows:
         _plot(folder / "curve.png", self.name, rows)
-    with csv_rows(folder / "curve.csv", learning.ROW) as write:
+    with console.csv_rows(folder / "curve.csv", learning.ROW) as write:
       for row in rows:
         write(row[name] for name in learning.ROW)
 

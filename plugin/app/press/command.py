@@ -13,16 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 from palpate import register
 
-from ..console import (
-  CommandError,
-  Interrupt,
-  Progress,
-  compile_error,
-  csv_rows,
-  output,
-  output_folder,
-  table,
-)
+from .. import console
+from ..console import CommandError
 from ..draw import film
 
 _NODES, _SEED = 1000, 1  # of the organ that ships
@@ -66,18 +58,18 @@ def add_arguments(parser: argparse.ArgumentParser):
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
   _check(args)
-  out = output_folder("out", args.out)
+  out = console.output_folder("out", args.out)
   video = _file(args, "video", out / "press.mp4", film.FILMS)
   picture = _file(args, "picture", out / "press_deepest.png", film.PICTURES)
   register()
   from . import figures, probe
 
-  with Interrupt() as interrupt, _warnings():
-    Progress().show("loading; the first run takes some seconds longer", always=True)
+  with console.Interrupt() as interrupt, _warnings():
+    console.Progress().show("loading; the first run takes some seconds longer", always=True)
     model, data, organ = _load(args)
     run = _Run(model, data, organ, probe.find(model, args.actuator), filmed=bool(video))
     failure = run.press(args, out / "press.csv", interrupt)
-    print(table(_summary(model, organ, run.samples)))
+    print(console.table(_summary(model, organ, run.samples)))
     print(f"\n{out / 'press.csv'}: {len(run.samples)} steps")
     if failure:
       print(f"palpate: {failure}; the data up to there is kept", file=sys.stderr)
@@ -117,14 +109,16 @@ class _Run:
     self._every = max(round(1 / (_FPS * _SLOWER) / model.opt.timestep), 1) if filmed else 0
     self.samples, self.states, self.deepest = [], [], None
 
-  def press(self, args: argparse.Namespace, path: pathlib.Path, interrupt: Interrupt) -> str | None:
+  def press(
+    self, args: argparse.Namespace, path: pathlib.Path, interrupt: console.Interrupt
+  ) -> str | None:
     """Presses and writes the CSV; returns what went wrong."""
     from . import figures, probe
 
-    model, data, progress = self._model, self._data, Progress()
+    model, data, progress = self._model, self._data, console.Progress()
     names = [field.name for field in dataclasses.fields(probe.Sample)]
     steps = probe.press(model, data, self._organ, self._tool, args.depth, args.speed, args.hold)
-    with csv_rows(path, names) as write:
+    with console.csv_rows(path, names) as write:
       for sample in steps:
         self.samples.append(sample)
         write(getattr(sample, name) for name in names)
@@ -164,7 +158,7 @@ def _file(args, option: str, default: pathlib.Path, suffixes: tuple) -> pathlib.
   name = getattr(args, option)
   if name is None:
     return None
-  path = output(option, name or default, suffixes)
+  path = console.output(option, name or default, suffixes)
   film.check(path.suffix)
   return path
 
@@ -238,15 +232,13 @@ def _compile(path: pathlib.Path, args: argparse.Namespace):
     model = spec.compile()
     data = mujoco.MjData(model)
   except (ValueError, mujoco.FatalError) as error:
-    raise CommandError(f"scene {path.name}: {compile_error(error)}") from None
+    raise CommandError(f"scene {path.name}: {console.compile_error(error)}") from None
   if model.nkey:
     mujoco.mj_resetDataKeyframe(model, data, 0)
   if not (names := list(instances(model))):
     raise CommandError(f"no organ in {path.name}, expected a flexcomp with plugin {NAME!r}")
-  try:
+  with console.one_line(before=f"scene {path.name}: "):
     return model, data, Organ(model, data, args.organ or names[0])
-  except ValueError as error:
-    raise CommandError(f"scene {path.name}: {error}") from None
 
 
 def _couple(spec, coupling: str, author):

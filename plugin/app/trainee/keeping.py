@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from .. import console
 from ..console import CommandError
 
 if TYPE_CHECKING:
@@ -70,11 +71,10 @@ def one_line():
   from .record import RecordError
 
   try:
-    yield
+    with console.one_line():
+      yield
   except RecordError as error:
     raise CommandError(str(error), code=1) from None
-  except ValueError as error:
-    raise CommandError(str(error)) from None
 
 
 def tell(record: Record) -> None:

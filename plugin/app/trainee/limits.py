@@ -8,7 +8,7 @@ from typing import Any
 
 import palpate
 
-from ..console import CommandError, output, writing
+from ..console import CommandError, output, write
 from . import keeping
 
 
@@ -32,7 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  from palpate.tasks.files import replacing
   from palpate.tasks.metrics import SUCCESS
   from palpate.tasks.people import limits
 
@@ -55,8 +54,7 @@ def main(args: argparse.Namespace) -> int:
     print(f"palpate: {text}", file=sys.stderr)
   if not made:
     raise CommandError("no limits were made", code=1)
-  with writing(path), replacing(path) as file:
-    file.write(limits.to_json(made))
+  write(path, limits.to_json(made))
   print(f"references {path}")
   return 0
 
