@@ -51,7 +51,8 @@ _COLOURS = wp.constant(wp.mat33(0.0, 0.0, 0.0, *scenes.LATER, *scenes.NOW))  # b
 @functools.cache
 def marking(own: Rules) -> Any:
   """Returns the kernel of a domain's marks."""
-  state, module = compiled(own)[0], wp.get_module(own.state.__module__)
+  # A module of its own: that of the rules, which is loaded, would be compiled anew.
+  state, module = compiled(own)[0], wp.get_module(f"{own.state.__module__}.marks")
   assert own.mark
   rule = translate(own.mark, module, dict(WORDS), set())
 
