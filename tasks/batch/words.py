@@ -138,9 +138,9 @@ def taut(s: Common):
 
 
 @word
-def tugged(s: Common, count: int):
-  least = s.tension[s.world, 0]
-  for k in range(1, count):
+def tugged(s: Common, first: int, count: int):
+  least = s.tension[s.world, first]
+  for k in range(first + 1, first + count):
     least = wp.min(least, s.tension[s.world, k])
   return least
 

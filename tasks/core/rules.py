@@ -294,9 +294,9 @@ def taut(s: Any) -> float:
   return float(s.thread.tension.max())
 
 
-def tugged(s: Any, count: int) -> float:
-  """Returns the least tension of so many of the thread's first edges [N]."""
-  return float(s.thread.tension[:count].min())
+def tugged(s: Any, first: int, count: int) -> float:
+  """Returns the least tension of so many of the thread's edges, from one on [N]."""
+  return float(s.thread.tension[first : first + count].min())
 
 
 def fasten(s: Any, o: Any, on: bool) -> None:

@@ -155,6 +155,22 @@ def test_throws_count_one_after_the_other_and_their_knot_is_let_go_of_and_tested
   assert 0.1 < found["security"] <= 2.0 and found["gap"] < drain.CLOSED < task.gap
 
 
+def test_a_throw_is_down_by_the_strands_in_the_hands_not_by_a_pull_elsewhere(env):
+  task, nodes = env.task, env.physics.thread.positions
+  task.seated = 1
+  lay(env, (1, -1))
+  draw(env, 1.5)
+  assert task.seated == 2
+  task.seated, task.stayed = 1, 0.0
+  task.held[:] = 20, len(nodes) - 10
+  first = mujoco.mj_name2id(env.physics.model.ptr, mujoco.mjtObj.mjOBJ_BODY, f"{drain.THREAD}_0")
+  apart = np.sign(nodes[0, 0] - nodes[-1, 0])
+  env.physics.data.ptr.xfrc_applied[[first + 1, first + 6], 0] = apart, -apart
+  draw(env, 0.4)
+  assert task.tension > 0.5 and task.gap < drain.CLOSED and task.tied == 2
+  assert task.seated == 1
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_knot_holds_in_many_worlds_what_it_holds_in_one(env, device):
   """In one world is the thread of an environment whose knot is about to be tested."""

@@ -74,7 +74,8 @@ _HIGH = float(MIDDLE[2])  # of the stitch [m]
 # in some 3 ms and does not whip; ours [N s/m^2].
 _DRAG = 0.02
 _LOOKS = 10  # control steps after which the knot is looked at
-_DRAWN = 0.5  # tension of a throw that is drawn on another one [N]
+# Tension of both strands of a throw that is drawn on another one [N], edges that it is read from.
+_DRAWN, _STRAND = 0.5, 6
 
 
 @exercise("suture/knot_easy", 40, "easy", "bimanual")
@@ -196,11 +197,15 @@ def follow(s, o):
   return o
 
 
-def is_down(o):
-  """Returns whether the throw whose turn it is is tied and drawn."""
-  if o.tied <= float(o.seated) or o.gap >= CLOSED:
-    return False
-  return o.seated == 0 or (o.firm[0] + o.firm[1] == 2 and o.tension > _DRAWN)
+def is_down(s, o):
+  """Returns whether the throw whose turn it is is tied and drawn, after the first by both hands."""
+  least = float(r.FAR)
+  for hand in range(2):
+    node = o.held[hand]
+    beside = node + 2 if 2 * node < r.strands(s) else node - 2 - _STRAND
+    pull = r.tugged(s, beside, _STRAND)
+    least = min(least, pull if o.firm[hand] == 1 else 0.0)
+  return o.tied > float(o.seated) and o.gap < CLOSED and (o.seated == 0 or least > _DRAWN)
 
 
 def judge(s, o):
@@ -210,7 +215,7 @@ def judge(s, o):
     return o, 0.95, outcome
   if o.broken or not o.whole:
     return o, -1.0, r.DAMAGED
-  o.stayed = o.stayed + o.control_timestep if is_down(o) else 0.0
+  o.stayed = o.stayed + o.control_timestep if is_down(s, o) else 0.0
   closing = r.clamp((GAPE - o.gap) / (GAPE - CLOSED), 0.0, 1.0)
   before = 2.0 * (o.tied - 1.0)
   progress = 0.45 * (before + 1.0 + closing) / float(o.throws) if o.tied > 0.0 else 0.0

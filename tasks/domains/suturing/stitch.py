@@ -108,7 +108,7 @@ def look(s, o):
     o = n.grasped(s, o, right, left)
     o.right_needle = right
     o.left_needle = left
-    if r.tugged(s, _BESIDE) > _OFF:
+    if r.tugged(s, 0, _BESIDE) > _OFF:
       r.fasten(s, o, False)
       o.attached = 0.0
   else:
