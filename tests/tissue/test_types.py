@@ -18,7 +18,8 @@ STRUCTS = ("Shape", "Tissue", "State", "System", "Transfer")
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
 def test_every_field_is_documented_in_order(cls):
-  text = cls.__doc__.split("Attributes:")[1]
+  told = [base.__doc__ for base in cls.__mro__ if dataclasses.is_dataclass(base)]
+  text = "".join(doc.split("Attributes:")[1] for doc in told)
   lines = re.findall(r"^\s{4,6}([a-z][\w, ]*?):", text, re.MULTILINE)
   documented = [name.strip() for line in lines for name in line.split(",")]
   fields = [field.name for field in dataclasses.fields(cls)]
