@@ -199,13 +199,17 @@ def follow(s, o):
 
 def is_down(s, o):
   """Returns whether the throw whose turn it is is tied and drawn, after the first by both hands."""
+  if o.tied <= float(o.seated) or o.gap >= CLOSED:
+    return False
+  if o.seated == 0:
+    return True
   least = float(r.FAR)
   for hand in range(2):
     node = o.held[hand]
     beside = node + 2 if 2 * node < r.strands(s) else node - 2 - _STRAND
     pull = r.tugged(s, beside, _STRAND)
     least = min(least, pull if o.firm[hand] == 1 else 0.0)
-  return o.tied > float(o.seated) and o.gap < CLOSED and (o.seated == 0 or least > _DRAWN)
+  return least > _DRAWN
 
 
 def judge(s, o):
