@@ -1,7 +1,7 @@
 """The exercises by name, and their ids in Gymnasium.
 
-    @exercise("touch/easy", 10, "easy", asks="Touch one point within 5 mm.", points=1)
-    @exercise("touch/standard", 30, asks="Touch four points within 3 mm.", points=4)
+    @exercise("touch/easy", 10, "easy", asks="Touch one point within 5 mm", points=1)
+    @exercise("touch/standard", 30, asks="Touch four points within 3 mm", points=4)
     class Touch(Task):
 
 adds two, wherever the module is; a module of another package is found if it is an entry point of

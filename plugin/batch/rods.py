@@ -108,7 +108,7 @@ class Thread(thread.Thread):
       if span.stop > span.start
     }
     widest = max(array.shape[1] for array in own.values())
-    self._none = wp.zeros((1, widest), dtype=wp.float64, device=device)
+    self._zero = wp.zeros((1, widest), dtype=wp.float64, device=device)
     self.ties = Ties(nworld, device)
     if organ.config.refine:
       self.ties.track(n)
@@ -209,7 +209,7 @@ class Thread(thread.Thread):
     batch._fresh = False
     wp.launch(kernels.lay, dim=local.shape, inputs=[laid], device=batch.device)
     for array in self.own.values():
-      inputs = [laid.mask, self._none, array]
+      inputs = [laid.mask, self._zero, array]
       wp.launch(kernels.put_back_rows, dim=array.shape, inputs=inputs, device=batch.device)
 
   @functools.cached_property

@@ -43,7 +43,7 @@ class Row:
     unit: of its numbers
     what: it is
     measure: takes task and physics, or the other hand's instrument for a sensor, returns it; None
-      for the method of the latter of its name
+      where physics and instruments have a method of the row's name that does
     only: what instruments have that have it: `jaws` or a `laparoscope`; empty for all
   """
 
@@ -369,7 +369,7 @@ def _numbers(task: Any, physics: Physics) -> collections.OrderedDict:
 
 
 def _rows(first: str, second: str) -> list[tuple[str, str, int]]:
-  """Returns names, rows and hands of instruments with these prefixes; the second's is sensors."""
+  """Returns names, their rows' names, and hands, by prefixes; the second hand has sensors alone."""
   out = [(name, name, 0) for name, row in ROWS.items() if _has(first, row.only)]
   for name, row in ROWS.items() if second else ():
     if row.group == "sensors" and _has(second, row.only):

@@ -37,7 +37,8 @@ HELD = (1e8, 3e4, 60.0)
 _SKIN, _MARGIN = 2.5e-4, 6e-4  # radius of the flex; of the thread's contacts, which come early [m]
 _RGBA, _BLOCK = (0.86, 0.72, 0.42, 1.0), (0.022, 0.02, 0.003)
 _STEEL = (0.75, 0.77, 0.8, 1.0)
-# Bits: of what meets instruments, the thread and the block under the drain; of what lies on that.
+# Contact bits: the thread and the block under the drain meet instruments by the first two, and each
+# other by the third.
 HANDS, BLOCK, LIES = 8, 16, 32
 _SAMPLES = 4001  # of a section
 # Of vertices that a test pulls at: from the mark, and nearer to the slit, at most [m]; the angle of
