@@ -78,18 +78,6 @@ _LOOKS = 10  # control steps after which the knot is looked at
 _DRAWN, _STRAND = 0.5, 6
 
 
-@exercise("suture/knot_easy", 40, "easy", "bimanual")
-def easy(**kwargs):
-  """Tie one throw with two needle drivers, and close the slit to 1 mm."""
-  return Knot(FIELD, **{"turns": (1,), **kwargs})
-
-
-@exercise("suture/knot_standard", 40, "bimanual")
-def standard(**kwargs):
-  """Tie a double throw, the first one of a surgeon's knot."""
-  return Knot(FIELD, **{"turns": (2,), **kwargs})
-
-
 class State:
   """State of a world."""
 
@@ -253,6 +241,12 @@ def observe(s, o):
   return o
 
 
+@exercise("suture/knot_easy", 40, "easy", "bimanual",
+          asks="Tie one throw with two needle drivers, and close the slit to 1 mm",
+          scene=FIELD, turns=(1,))  # fmt: skip
+@exercise("suture/knot_standard", 40, "bimanual",
+          asks="Tie a double throw, the first one of a surgeon's knot",
+          scene=FIELD, turns=(2,))  # fmt: skip
 class Knot(drain.Sewn):
   """Tie a knot with two needle drivers.
 
