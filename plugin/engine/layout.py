@@ -223,6 +223,7 @@ TIE = Numbers(
   ("bears", 1, "N", "what holds it across"),
   ("force", 3, "N", "on the thread, of the step"),
   ("torn", 3, "m", "how far that has torn what holds it"),
+  ("stop", 1, "m", "how far it keeps off along that way, of what it pushes only; or 0"),
 )
 
 # The last numbers of the plugin state of a windowed organ.

@@ -408,7 +408,7 @@ def test_a_knot_does_not_go_through_a_hole(knotted):
   spec = mujoco.MjSpec()
   spec.option.timestep, spec.option.gravity = STEP, (0, 0, 0)
   straight = line[0] + edge * np.arange(count)[:, None] * way
-  contact = {"friction": 0.1, "contype": 0, "conaffinity": 0}
+  contact = {"friction": 0.3, "contype": 0, "conaffinity": 0}
   palpate.add_thread(spec, straight, "suture", strength=0, iterations=1000, contact=contact)
   hand = spec.worldbody.add_body(name="hand", pos=line[0] + (0, RADIUS, 0))
   palpate.add_needle(spec, length=LENGTH, parent=hand, thread="suture")

@@ -9,7 +9,7 @@ from benchmarks.timing import batch as timing
 from devices import needs_cuda
 from palpate.tasks.core import stage
 from palpate.tasks.core.scenes import Scene
-from palpate.tasks.domains.suturing import drain
+from palpate.tasks.domains.suturing import drain, extracorporeal
 
 NODES = 150
 
@@ -65,6 +65,32 @@ def test_holes_that_a_thread_draws_together_come_to_rest():
   assert second.along - first.along == pytest.approx(2 * edge, rel=1e-3)
   assert np.linalg.norm(first.at - second.at) < 2 * edge
   assert first.torn == second.torn == 0
+
+
+def test_a_throw_is_stopped_at_a_hole_where_one_strand_is_let_go():
+  """Its strand, wound around the one that is drawn, slid on past both holes, through the wall."""
+  ends = drain.MIDDLE + np.array([(-0.02, 0.0, 0.004), (0.02, 0.0, 0.004)])
+  post, tail = extracorporeal.strands(0.003, 1)
+  line = np.concatenate([ends[:1], post[-2::-1], tail[:-1], ends[1:]])
+  along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
+  at = np.arange(0.0, along[-1], drain.EDGE)
+  nodes = np.stack([np.interp(at, along, x) for x in line.T], axis=1)
+  spec = drain.build(Scene(instrument="psm", nodes=NODES, surroundings="none"), nodes)
+  model = stage.compile_spec(spec)
+  data = mujoco.MjData(model)
+  organ = palpate.Organ(model, data, "organ")
+  thread = drain.sew(organ, line)
+  held, free = (data.body(f"{drain.THREAD}_{node}").xfrc_applied for node in (len(nodes) - 1, 0))
+  for k in range(500):
+    drawn = 0.6 * min(1.0, 0.01 * k)
+    held[:3] = drawn * np.array([1.0, 0.0, 0.2])
+    free[:3] = max(0.0, min(drawn, 1.8 - 0.006 * k)) * np.array([-1.0, 0.0, 0.2])
+    mujoco.mj_step(model, data)
+  assert organ.error is None and len(organ.pinholes) == 2
+  first = min(int(-hole.along / drain.EDGE) for hole in organ.pinholes)
+  wound = thread.positions[: first - 5]
+  off = min(np.linalg.norm(wound - hole.at, axis=1).min() for hole in organ.pinholes)
+  assert off < 6e-4
 
 
 @pytest.mark.slow

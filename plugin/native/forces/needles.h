@@ -461,10 +461,10 @@ CALLED double rubs(const Fields& f, int i, const Arc& arc, const Passing& by, do
   return (share > HAIRPIN ? share : HAIRPIN) * (most + law[PIERCE_FRICTION] * length_in(f, i, arc, s, n));
 }
 
-// Whether a knot is at a hole, on the side from which the thread would slide in by a way: other parts of it are around
-// it there, which touch it from sides that face each other. A strand that lies beside it would give way.
-template <class Fields>
-CALLED bool is_knotted(const Fields& f, int i, const Passing& by, double* s, int n, int way) {
+// Other parts of a thread that touch it at a hole, on the side from which it would slide in by a way: calls each(edge, off)
+// for those, with how far they are from it, and aside of that part; until that returns true, which this returns.
+template <class Fields, class Each>
+CALLED bool touching_at(const Fields& f, int i, const Passing& by, double* s, int n, int way, const Each& each) {
   const double* law = f.law.data + PIERCE_LENGTH * i;
   const double thick = law[PIERCE_KNOT], place = hole(s, n)[HOLE_THREAD];
   const double reach = 0.5 * law[PIERCE_WALL] + BEFORE * thick, end = place - way * reach;
@@ -472,19 +472,14 @@ CALLED bool is_knotted(const Fields& f, int i, const Passing& by, double* s, int
   const auto thread = strand_of(f, i);
   double part, start = 0.0;
   const int e = thread.find(end, part);
-  const D3 span = thread.at(e) + part * (thread.at(e + 1) - thread.at(e)) - by.at, along = unit_of(span);
-  D3 first = {0.0, 0.0, 0.0};
+  const D3 span = thread.at(e) + part * (thread.at(e + 1) - thread.at(e)) - by.at;
   for (int j = 0; j + 1 < thread.count;) {
     const D3 p = thread.at(j);
     const double length = thread.edge(j), middle = start + 0.5 * length;
     double room = norm(p - by.at) - reach - TOUCHES * thick;
     if (room < STRETCHED * length && fabs(middle - 0.5 * (place + end)) > 0.5 * (length + reach) + TURNS * thick) {
       const D3 off = shortest(p, thread.at(j + 1) - p, by.at, span);
-      if (norm(off) < TOUCHES * thick) {
-        const D3 aside = across(off, along);
-        if (dot(first, aside) < 0.0) return true;
-        if (dot(first, first) == 0.0) first = aside;
-      }
+      if (norm(off) < TOUCHES * thick && each(j, off, span)) return true;
     }
     do {  // on to where the thread may be near again
       room -= STRETCHED * thread.edge(j);
@@ -492,6 +487,19 @@ CALLED bool is_knotted(const Fields& f, int i, const Passing& by, double* s, int
     } while (++j + 1 < thread.count && room > STRETCHED * thread.edge(j));
   }
   return false;
+}
+
+// Whether a knot is at a hole, on the side from which the thread would slide in by a way: other parts of it are around
+// it there, which touch it from sides that face each other. A strand that lies beside it would give way.
+template <class Fields>
+CALLED bool is_knotted(const Fields& f, int i, const Passing& by, double* s, int n, int way) {
+  D3 first = {0.0, 0.0, 0.0};
+  return touching_at(f, i, by, s, n, way, [&](int, const D3& off, const D3& span) {
+    const D3 aside = across(off, unit_of(span));
+    if (dot(first, aside) < 0.0) return true;
+    if (dot(first, first) == 0.0) first = aside;
+    return false;
+  });
 }
 
 // What a hole bears along a thread. One that has met the next presses on that, and slides on with it alone: all that have
@@ -661,6 +669,34 @@ PALPATE void measure_thread(const Fields& all, Thread t, int i) {
   });
 }
 
+// Ties strands that touch a thread beside a hole, on the side from which it would slide in by a way: they do not slide
+// along it into the wall. A tie there holds the hole as well. Between two holes the thread is in tissue, or short.
+template <class Fields>
+CALLED void stop_strands(const Fields& all, int i, const Passing& by, double* s, int n, int way, const double* held) {
+  const auto& f = all.pierced;
+  const double* law = f.law.data + PIERCE_LENGTH * i;
+  const auto thread = strand_of(f, i);
+  if (next_on_thread(s, n, way) > 0.0) return;
+  int last = -1;
+  touching_at(f, i, by, s, n, way, [&](int edge, const D3&, const D3& span) {
+    const D3 out = unit_of(span);
+    for (int j = edge > last ? edge : last + 1; j < edge + 2; ++j) {
+      const int at = all.tie_count.data[0];
+      if (at == MOST_TIES || j + 1 == thread.count) return true;
+      last = j;
+      if (dot(thread.at(j) - by.seat.at, out) < 0.0) continue;
+      double* tie = all.tie_value.data + TIE_LENGTH * at;
+      for (int c = 0; c < TIE_LENGTH; ++c) tie[c] = held[c];
+      store(tie + TIE_ALONG, add_turned({0.0, 0.0, 0.0}, all.frame.data, turned(f.own.frame.data, out)));
+      tie[TIE_PART] = 0.0;
+      tie[TIE_STOP] = 0.5 * (law[PIERCE_WALL] + law[PIERCE_KNOT]);
+      all.tie_edge.data[at] = j;
+      all.tie_count.data[0] = at + 1;
+    }
+    return false;
+  });
+}
+
 // Says what holds a needle's thread, as the step begins: the points of the tissue where they will be.
 template <class Fields>
 PALPATE void aim_thread(const Fields& all, Thread t, int i) {
@@ -694,8 +730,10 @@ PALPATE void aim_thread(const Fields& all, Thread t, int i) {
     tie[TIE_FRICTION] = thread_friction(f, i, arc, by, s, n);
     tie[TIE_BEARS] = bears_across(f, i, arc, s, n);
     store(tie + TIE_ALONG, add_turned({0.0, 0.0, 0.0}, all.frame.data, turned(f.own.frame.data, by.along)));
+    tie[TIE_STOP] = 0.0;
     all.tie_edge.data[at] = by.edge;
     all.tie_count.data[0] = at + 1;
+    for (int way = -1; way <= 1; way += 2) stop_strands(all, i, by, s, n, way, tie);
   }
 }
 
@@ -713,12 +751,16 @@ PALPATE void feel_thread(const Fields& all, Thread t, int i) {
     const D3 zero = {0.0, 0.0, 0.0};
     const double* tie = all.tie_value.data + TIE_LENGTH * at;
     const bool felt = at < MOST_TIES;
+    int stops = 0;
+    D3 force = zero - load(tie + TIE_FORCE);
+    for (int k = at + 1; k < all.tie_count.data[0] && all.tie_value.data[TIE_LENGTH * k + TIE_STOP] > 0.0; ++k)
+      force = force - load(all.tie_value.data + TIE_LENGTH * k + TIE_FORCE), ++stops;
     const auto put = [&](double* into, D3 a) {
       store(into + 3 * (POINTS * i + n), felt ? add_turned(zero, f.own.frame.data, turned(all.frame.data, a)) : zero);
     };
-    put(f.pull.data, zero - load(tie + TIE_FORCE));
+    put(f.pull.data, force);
     put(f.torn.data, load(tie + TIE_TORN));
-    at += felt;
+    at += felt + stops;
   }
 }
 

@@ -1,6 +1,6 @@
 // What a rod goes through: points that hold it, each tied to a place on an edge by a spring, which along the rod bears no
 // more than friction does, and across it no more than the point, which tears. The rod's step takes them to move on as they
-// do; what holds it takes the force that comes of that.
+// do; what holds it takes the force that comes of that. Where a tie stops the rod it pushes only, along one way.
 #pragma once
 #include "tissue/rod_contact.h"
 
@@ -25,6 +25,16 @@ CALLED double ties_energy(const Fields& f, const double* x, double* g, const Rod
     const D3 at = w[0] * load(x + 3 * i) + w[1] * load(x + 3 * i + 3), along = load(tie + TIE_ALONG);
     const D3 pull = at - load(tie + TIE_AIM);
     const double ahead = dot(pull, along), far = fabs(ahead);
+    if (tie[TIE_STOP] > 0.0) {  // pushes only, along that way
+      const double in = ahead < tie[TIE_STOP] ? tie[TIE_STOP] - ahead : 0.0;
+      sum += 0.5 * firm * in * in;
+      store(tie + TIE_FORCE, firm * in * along);
+      if (!g || in == 0.0) return;
+      Terms<2> terms;
+      terms.add(w, along, -firm * in, firm);
+      terms.scatter(node, g, *H);
+      return;
+    }
     const double over = far > slack ? far - slack : 0.0;
     const double per = over > 0.0 ? (firm * slack + DRAG * firm * over) / far : firm;
     const D3 off = pull - ahead * along;
