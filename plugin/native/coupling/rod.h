@@ -502,19 +502,21 @@ PALPATE bool is_open(const Host& host, const int* flex, const int* elem, const i
   return false;
 }
 
-// Breaks the edge with the highest tension at the end of a step, if that is more than it bears.
+// Breaks the edge with the highest tension, if that is more than it bears as a step begins and as it ends: in a single step
+// one that is as stiff as thread has peaks, where a strand that slips strikes another one.
 template <class Rod>
 PALPATE void break_edge(const Rod& rod) {
+  const auto tension = [&](int i) {
+    const double first = tension_of(rod, rod.start.data, i), last = tension_of(rod, rod.place.data, i);
+    return first < last ? first : last;
+  };
   double most = rod.strength;
-  each_lane(0, rod.strength > 0.0 ? rod.nnode - 1 : 0, [&](int i) {
-    const double tension = tension_of(rod, rod.place.data, i);
-    most = tension > most ? tension : most;
-  });
+  each_lane(0, rod.strength > 0.0 ? rod.nnode - 1 : 0, [&](int i) { most = tension(i) > most ? tension(i) : most; });
   most = most_together(most);
   if (!(most > rod.strength)) return;
   one_lane([&] {
     int weakest = 0;
-    while (tension_of(rod, rod.place.data, weakest) != most) ++weakest;
+    while (tension(weakest) != most) ++weakest;
     rod.own.broken.data[weakest] = 1.0;
     rod.own.twist.data[weakest] = 0.0;  // of its two nodes
     rod.own.twist.data[weakest + 1] = 0.0;
