@@ -203,7 +203,7 @@ def test_a_knot_holds_in_many_worlds_what_it_holds_in_one(env, device):
       ended.setdefault(k, (final["outcome"][k], final["metrics"]))
     if not env.task.outcome:
       env.step(still(env))
-    if env.task.pulled < drain.PULL:
+    if env.task.gap < drain.CLOSED:
       assert seen["gap"][0, 0] == pytest.approx(env.task.gap, abs=2e-4)
   while not env.task.outcome:
     env.step(still(env))
