@@ -359,12 +359,12 @@ def tied_of_each(s: Common, turns: wp.array[int], found: wp.array[int]):
   found[w] = throws.tied(s, w, turns)  # pyright: ignore[reportIndexIssue, reportArgumentType]
 
 
-def test_a_tail_that_is_let_go_rests_on_the_block(env):
+def test_a_tail_that_is_let_go_rests_on_foam_where_jaws_can_take_it(env):
   physics = env.physics
   last = mujoco.mj_name2id(physics.model.ptr, mujoco.mjtObj.mjOBJ_BODY, f"{drain.THREAD}_0")
   last += len(physics.thread.positions) - 1
   for _ in range(40):
     physics.data.ptr.xfrc_applied[last, 2] = -5e-4  # its end is pressed down
     env.step(still(env))
-    assert physics.thread.positions[-1, 2] > -1e-3
-  assert physics.thread.positions[-1, 2] < 1e-3
+    assert physics.thread.positions[-1, 2] > 1e-3
+  assert physics.thread.positions[-1, 2] < 3e-3

@@ -37,10 +37,13 @@ HELD = (1e8, 3e4, 60.0)
 _SKIN, _MARGIN = 2.5e-4, 6e-4  # radius of the flex; of the thread's contacts, which come early [m]
 _RGBA, _BLOCK = (0.86, 0.72, 0.42, 1.0), (0.022, 0.02, 0.003)
 _STEEL = (0.75, 0.77, 0.8, 1.0)
-# Contact bits: the thread and the block under the drain meet instruments by the first two, and each
-# other by the third.
+# Contact bits: the thread and the block under the drain meet instruments by the first two, thread
+# and foam each other by the third.
 HANDS, BLOCK, LIES = 8, 16, 32
 _SAMPLES = 4001  # of a section
+# Height of foam on the block: tails lie on it, and jaws reach into it. They cannot take what lies
+# on the block, as they are round and hold it 3.6 mm from their tips [m].
+_SOFT, _FOAM = 0.002, (0.45, 0.6, 0.75, 1.0)
 # Of vertices that a test pulls at: from the mark, and nearer to the slit, at most [m]; the angle of
 # its pull over the table [rad].
 _NEAR, _EDGE, _LIFT = 0.002, 1e-4, 0.6
@@ -104,7 +107,7 @@ def build(
   Args:
     scene: what it plays in; its organ has about so many nodes
     line: the thread's nodes, from where the needle was to the other end [m]  (n, 3)
-    meets: bits of what the thread meets: `HANDS` the instruments, `LIES` the block, 1 the drain
+    meets: bits of what the thread meets: `HANDS` the instruments, `LIES` foam, 1 the drain
     friction: of needle and thread in the drain [N/m]
     tough: energy that it takes to open an area of it [J/m^2]
     wall: keys of its tissue
@@ -127,9 +130,15 @@ def build(
   )
   block = mjcf.tag("geom", {
     "type": "box", "size": np.array(_BLOCK), "pos": np.array([0.0, 0.0, -_BLOCK[2]]),
-    "rgba": "0.25 0.4 0.6 1", "contype": 0, "conaffinity": BLOCK | LIES, "mass": 0,
+    "rgba": "0.25 0.4 0.6 1", "contype": 0, "conaffinity": BLOCK, "mass": 0,
   })  # fmt: skip
   spec = scenes.furnish(scene, flex, MIDDLE, block, slots=0)
+  if meets & LIES:
+    half = (*_BLOCK[:2], 0.5 * _SOFT)
+    spec.worldbody.add_geom(
+      type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=(0.0, 0.0, half[2]), rgba=_FOAM, contype=0,
+      conaffinity=LIES, mass=0,
+    )  # fmt: skip
   sheet.lie_in_fat(spec, scene)
   for geom in spec.geoms:
     if geom.parent.name.startswith(tuple(filter(None, scene.prefixes))) and geom.contype & 1:

@@ -5,8 +5,8 @@ its short tail stands free on the right, its long one is in the right hand. One 
 tail around the other's jaws, once or twice, which take the short tail and draw it through; both
 hands draw the throw down. The levels end with this throw, and so does the expert. Where `turns`
 asks for several, each goes the other way round than the one before, and a tail that is let go
-rests on the block. Outside of its holes the thread does not meet the drain, and throws slide along
-a tail that is taut before the other one, past both holes.
+rests on foam. Outside of its holes the thread does not meet the drain, which stops throws only
+there.
 
 Jaws that press on the thread hold it: an equality joins them to the node that is between them.
 Threads meet the jaws as round, smooth bodies, on which a loop slides off: the inserts, whose
@@ -71,8 +71,8 @@ _ROUND, _CLEVIS, _JAW, _LINK, _STEEL = 0.001, 0.0026, 0.0102, 0.0091, (0.1, 0.00
 _SHUT, _ACROSS_IT, _BESIDE_IT, _ALONG_IT, _PADS = 0.08, 0.0004, 0.0009, 0.0026, 0.0036
 _HIGH = float(MIDDLE[2])  # of the stitch [m]
 # Where tails are let go of, between throws: inner friction of a braid, by which one comes to rest
-# in some 3 ms and does not whip; ours [N s/m^2].
-_DRAG = 0.02
+# in some 0.6 ms and does not whip; ours [N s/m^2].
+_DRAG = 0.1
 _LOOKS = 10  # control steps after which the knot is looked at
 # Tension of both strands of a throw that is drawn on another one [N], edges that it is read from.
 _DRAWN, _STRAND = 0.5, 6
