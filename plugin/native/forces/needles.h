@@ -669,8 +669,8 @@ PALPATE void measure_thread(const Fields& all, Thread t, int i) {
   });
 }
 
-// Ties strands that touch a thread beside a hole, on the side from which it would slide in by a way: they do not slide
-// along it into the wall. A tie there holds the hole as well. Between two holes the thread is in tissue, or short.
+// Ties strands that touch a thread beside a hole, on the side from which it would slide in by a way, so that they do not
+// slide along it into the wall. They aim where the hole's own tie does, `held`. Between two holes nothing is stopped.
 template <class Fields>
 CALLED void stop_strands(const Fields& all, int i, const Passing& by, double* s, int n, int way, const double* held) {
   const auto& f = all.pierced;
