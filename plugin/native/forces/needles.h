@@ -461,8 +461,9 @@ CALLED double rubs(const Fields& f, int i, const Arc& arc, const Passing& by, do
   return (share > HAIRPIN ? share : HAIRPIN) * (most + law[PIERCE_FRICTION] * length_in(f, i, arc, s, n));
 }
 
-// Other parts of a thread that touch it at a hole, on the side from which it would slide in by a way: calls each(edge, off)
-// for those, with how far they are from it, and aside of that part; until that returns true, which this returns.
+// Calls each(edge, off, span) for the edges of a thread that touch it at a hole, on the side from which it would slide in
+// by a way. `span` is the part of it that they touch, from the hole on, and `off` the shortest way between them. It ends
+// where a call returns true, and returns whether one did.
 template <class Fields, class Each>
 CALLED bool touching_at(const Fields& f, int i, const Passing& by, double* s, int n, int way, const Each& each) {
   const double* law = f.law.data + PIERCE_LENGTH * i;

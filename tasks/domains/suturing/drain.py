@@ -37,8 +37,8 @@ HELD = (1e8, 3e4, 60.0)
 _SKIN, _MARGIN = 2.5e-4, 6e-4  # radius of the flex; of the thread's contacts, which come early [m]
 _RGBA, _BLOCK = (0.86, 0.72, 0.42, 1.0), (0.022, 0.02, 0.003)
 _STEEL = (0.75, 0.77, 0.8, 1.0)
-# Contact bits: the thread and the block under the drain meet instruments by the first two, thread
-# and foam each other by the third.
+# Contact bits: the thread and the block under the drain meet instruments by the first two. The
+# thread and the foam meet by the third.
 HANDS, BLOCK, LIES = 8, 16, 32
 _SAMPLES = 4001  # of a section
 # Height of foam on the block: tails lie on it, and jaws reach into it. They cannot take what lies
