@@ -95,6 +95,18 @@ def test_a_broken_thread_fails_and_a_test_pulls_at_the_wall_beyond_the_marks():
   assert env.task.outcome == "damage"
 
 
+@pytest.mark.parametrize("tested", [False, True])
+def test_what_strikes_the_pusher_is_damage_but_while_a_knot_is_tested(tested):
+  env = load("extracorporeal_standard", damage=1e-3)
+  env.reset()
+  if tested:  # a drain whose stitch gives way, and its thread, strike with some 10 N
+    env.task.seated = env.task.throws
+  for _ in range(10):
+    if env.step(np.array([0.0, 0.0, -0.5, 0.0])).last():
+      break
+  assert env.task.outcome == (None if tested else "damage")
+
+
 def test_the_test_of_a_knot_pulls_and_does_not_kick():
   env = load("extracorporeal_standard")
   env.reset()

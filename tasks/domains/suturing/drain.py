@@ -217,8 +217,9 @@ def follow_stitch(s, o):
   o.whole = count == 2
   o.broken = r.snapped(s)
   o.tension = r.taut(s)
-  o.hardest = max(o.hardest, pull)
-  o.tightest = max(o.tightest, o.tension)
+  if o.free == 0.0:  # the test's pull is no hand's doing
+    o.hardest = max(o.hardest, pull)
+    o.tightest = max(o.tightest, o.tension)
   o.gap = 0.0
   for k in range(o.lips.shape[0]):
     o.gap = max(o.gap, float(r.vertex(s, o.lips[k, 0])[0] - r.vertex(s, o.lips[k, 1])[0]))
@@ -234,7 +235,7 @@ class Sewn(Task):
   stitch is lifted and pulled apart, harder and harder to 2 N. It holds where the slit is closed to
   1 mm when the strands are let go, and gapes less than unsewn, 2.4 mm, up to a pull of 0.6 N, with
   which its strands were drawn. The pull at which it gapes so, or the thread breaks or is torn out,
-  is its security.
+  is its security. Forces of the test are no hand's doing, and not counted.
 
   Attributes:
     turns: how often the strands wind about each other in each throw
@@ -305,6 +306,8 @@ class Sewn(Task):
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns tension, the pull on the drain, what the knot held, and the gap before its test."""
-    pull = float(np.linalg.norm(physics.needle().force))
-    found = {"traction": pull, "gap": self.left, "tension": self.tension}
+    pull, tension = float(np.linalg.norm(physics.needle().force)), self.tension
+    if self.free:
+      pull = tension = 0.0
+    found = {"traction": pull, "gap": self.left, "tension": tension}
     return found | ({"security": self.security} if self.throws > 1 else {})
