@@ -217,7 +217,7 @@ def follow_stitch(s, o):
   o.whole = count == 2
   o.broken = r.snapped(s)
   o.tension = r.taut(s)
-  if o.free == 0.0:  # the test's pull is no hand's doing
+  if o.free == 0.0:  # the test's pull is not the trainee's
     o.hardest = max(o.hardest, pull)
     o.tightest = max(o.tightest, o.tension)
   o.gap = 0.0
@@ -235,7 +235,7 @@ class Sewn(Task):
   stitch is lifted and pulled apart, harder and harder to 2 N. It holds where the slit is closed to
   1 mm when the strands are let go, and gapes less than unsewn, 2.4 mm, up to a pull of 0.6 N, with
   which its strands were drawn. The pull at which it gapes so, or the thread breaks or is torn out,
-  is its security. Forces of the test are no hand's doing, and not counted.
+  is its security. The pull on the drain and the tension in the test do not count.
 
   Attributes:
     turns: how often the strands wind about each other in each throw

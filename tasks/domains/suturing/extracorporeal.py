@@ -175,7 +175,7 @@ class Extracorporeal(drain.Sewn):
       places = knots.closed(physics.thread.positions, np.array([-1.0, 0.0, 0.0]))
       self.knot = knots.name(places)
       self.right = knots.same(knots.throws(places) or (), self.turns)
-    # What gives way at last and strikes the pusher is no hand's doing.
+    # A stitch that gives way in the test throws thread at the pusher: not the trainee's doing.
     steps = len(physics.forces()["force"])
     physics.keep(np.zeros((steps, physics.model.nsensordata)))
     _, outcome = drain.pull_test(physics, self)
