@@ -142,9 +142,11 @@ class Inputs:
 
   @property
   def at_work(self) -> np.ndarray | None:
-    """Whether any instrument had contact since the sample before  (nstep,)."""
+    """Whether any instrument had contact since the sample before, or a knot is tested  (nstep,)."""
     each = [self._recording.touching(k) for k in self._which]
     known = [touch for touch in each if touch is not None]
+    if (security := self._recording.column("security", self._which[0])) is not None:
+      known.append(security > 0.0)  # who waits for the test has nothing else to do
     return np.any(known, axis=0) if known else None
 
   @property

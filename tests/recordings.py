@@ -31,6 +31,8 @@ def exercise(steps=300, instruments=("left", "right"), seed=0, journal=None):
     half = 0.3 * np.sin(k / 40)
     quat = np.array([np.cos(half), 0, np.sin(half), 0])
     force = np.maximum(0, rng.randn(len(instruments), 3))
+    drawn = {name: rng.rand(len(instruments)) * size for name, size in DRAWN.items()}
+    drawn["security"] *= k > 0.9 * steps  # knots are tested at the end
     recorder.append(
       k * 0.02,
       pos[k],
@@ -41,7 +43,7 @@ def exercise(steps=300, instruments=("left", "right"), seed=0, journal=None):
       surroundings_force=np.maximum(0, rng.randn(len(instruments))),
       area=np.full(len(instruments), 2e-5),
       freed=np.full(len(instruments), k / steps),
-      **{name: rng.rand(len(instruments)) * size for name, size in DRAWN.items()},
+      **drawn,
       grip=np.full(len(instruments), k % 100 < 60),
       held=np.full(len(instruments), 10 < k % 100 < 40),
       visible=rng.rand(len(instruments)) > 0.1,

@@ -142,6 +142,15 @@ def test_a_still_instrument_is_unknown_not_perfect():
   assert plain(LINE, quat=quat).metrics().angular_path == 0  # moved without turning: known
 
 
+def test_who_waits_while_a_knot_is_tested_is_not_idle():
+  tested = np.r_[np.zeros(31), np.linspace(0.1, 2.0, 30)]
+  idle = [
+    plain(0 * LINE, force=np.zeros(61), security=security).metrics().idle_time
+    for security in (np.zeros(61), tested)
+  ]
+  assert idle[1] == pytest.approx(0.5 * idle[0]) and idle[0] > 0.5
+
+
 def test_instruments_combine():
   made = exercise()
   both, left, right = made.metrics(), made.metrics(0), made.metrics(1)
